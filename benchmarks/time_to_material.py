@@ -29,8 +29,8 @@ from benchmarks.project_scenes import (
 )
 from benchmarks.timing import device_name, synchronize
 from neuma_lib.device import choose_device
-from neuma_lib.fitting import identify as identification
 from neuma_lib.fitting import structured_fit
+from neuma_lib.fitting.family_run import FamilyRun
 from neuma_lib.fitting.identify import identify
 from neuma_lib.fitting.material import PixelLoss
 from neuma_lib.fitting.structured_fit import rival_bases, train_structured
@@ -45,12 +45,12 @@ METHOD = "neuma_structured"
 IDENTIFYING = {
     "simulating": (VideoResiduals, "_paths"),
     "rendering": (VideoResiduals, "_residual"),
-    "linearising": (identification._Run, "linearise"),
-    "uncertainties": (identification._Run, "_covariance"),
+    "linearising": (FamilyRun, "linearise"),
+    "uncertainties": (FamilyRun, "_covariance"),
 }
 CORRECTING = {
     "training": (structured_fit, "train_material"),
-    "scoring": (structured_fit, "_simulated"),
+    "scoring": (structured_fit, "_simulate"),
 }
 
 

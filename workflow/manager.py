@@ -1,7 +1,7 @@
-"""The Snakemake process that a script works for.
+"""The Snakemake process of a script.
 
-A Snakemake that is killed outright (SIGKILL, out of memory) cannot stop its jobs; a second run would compute beside
-them. A script therefore watches the outermost Snakemake above it and ends with it; its checkpoint keeps what was done.
+A Snakemake that is killed (SIGKILL, out of memory) cannot stop its jobs, and a second run would compute the same at the
+same time. A script therefore watches the outermost Snakemake above it and ends with it. Its checkpoint keeps the work.
 """
 
 from __future__ import annotations

@@ -72,10 +72,10 @@ class Prediction:
         by_name = {name: listed(inputs[name]) for name in method["files"]}
         self._files = [{name: by_name[name][k] for name in by_name} for k in range(len(self._options))]
 
-    def start(self, densities: list, carrier: str) -> tuple[State, list[int]]:
+    def start(self, densities: list, particle_source: str) -> tuple[State, list[int]]:
         """Particles in motion, and how many belong to each body."""
         files = self._files[0] | {name: self._inputs[name] for name in START}
-        return self.method.load_initial_state(files, self._options[0], densities, carrier)
+        return self.method.load_initial_state(files, self._options[0], densities, particle_source)
 
     def model(self, dt: float, counts: list[int] | None = None) -> MotionModel:
         """The model of all bodies, at a time step [s]."""
@@ -92,9 +92,9 @@ class Prediction:
             )
         return law
 
-    def body(self, density, carrier: str, gaussian_motion: str, device: torch.device):
+    def body(self, density, particle_source: str, gaussian_motion: str, device: torch.device):
         """The body that renders the motion."""
         files = self._files[0] | {name: self._inputs[name] for name in START[:3]}
         return self.method.load_reconstruction(
-            files, self._options[0], density, carrier, gaussian_motion, device
+            files, self._options[0], density, particle_source, gaussian_motion, device
         )

@@ -53,8 +53,7 @@ ROOM_FROM_WORLD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """From the axes of the files (z down) to the room's (y up)."""
 MIDDLE = (0.15, 0.20)
 """x and y of the middle of the volume for objects in Spring-Gaus' settings."""
-MASK_MARGIN = 3
-"""Width of the border around a mask that may still show the object [px]."""
+_MASK_MARGIN = 3  # width of the border around a mask that may still show the object [px]
 _MODELS = {0: "SIMPLE_PINHOLE", 1: "PINHOLE", 2: "SIMPLE_RADIAL", 3: "RADIAL", 4: "OPENCV"}
 _PARAMETERS = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8}
 _SUFFIXES = (".jpg", ".jpeg", ".png")
@@ -395,11 +394,11 @@ def read_shots(shots: Sequence[Shot], longest: int) -> Iterator[tuple[np.ndarray
 
 
 def background_behind(pictures: Sequence[np.ndarray], masks: Sequence[np.ndarray]) -> np.ndarray:
-    """The empty scene (H, W, 3), uint8: median of pixels outside the masks (H, W), dilated by `MASK_MARGIN`.
+    """The empty scene (H, W, 3), uint8: median of pixels outside the masks (H, W), dilated by `_MASK_MARGIN`.
 
     Where all masks overlap, it is the median of all pixels.
     """
-    covered = np.stack([binary_dilation(mask, iterations=MASK_MARGIN) for mask in masks])
+    covered = np.stack([binary_dilation(mask, iterations=_MASK_MARGIN) for mask in masks])
     covered[:, covered.all(axis=0)] = False
     seen = np.ma.masked_array(np.stack(pictures), np.repeat(covered[..., None], 3, axis=-1))
     return np.ma.median(seen, axis=0).filled(0).round().astype(np.uint8)

@@ -8,7 +8,6 @@ the end those with an opacity of at most 0.02, as in the paper.
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -18,11 +17,13 @@ from torch import Tensor
 
 from neuma_lib.config.gaussians import GaussiansConfig
 from neuma_lib.errors import InputError, NonFiniteError
-from neuma_lib.geometry.visual_hull import Hull, check_masks, visual_hull
+from neuma_lib.fitting.image_quality import image_loss, mean_psnr
+from neuma_lib.fitting.initial_gaussians import START_SCALE, initial_gaussians
+from neuma_lib.geometry.visual_hull import check_masks, visual_hull
 from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.gaussians import Gaussians, covariances, rotations
 from neuma_lib.splatting.rasterizer import RenderBuffers, Statistics, rasterize
-from neuma_lib.splatting.spherical_harmonics import SH_C0, coefficient_count, rgb_to_sh0
+from neuma_lib.splatting.spherical_harmonics import SH_C0
 
 
 @dataclass
@@ -55,14 +56,6 @@ class GaussianFitReport:
 
 EPS2D = 0.3
 """Variance that a pixel adds to a splat during the fit [px^2], as usual in Gaussian splatting."""
-_SHEET_PACKING = 1.15
-"""Squared spacing per area of a point in a hexagonal sheet, 2 / sqrt(3) rounded."""
-_VOLUME_PACKING = 1.41
-"""Cubed spacing per volume of a point in close packing, sqrt(2) rounded."""
-_START_SCALE = 0.5
-"""Initial standard deviation relative to the spacing."""
-_COLOUR_DEPTHS = 0.05
-"""Decay length of the weights of cameras in the initial colours, as a share of the mean depth."""
 _BETAS, _EPS = (0.9, 0.99), 1e-15
 """Betas and epsilon of Adam (3DGS uses 0.9, 0.999, but fits here are 20 times shorter)."""
 _MEANS_DECAY, _RATE_DECAY = 0.01, 0.1
@@ -108,7 +101,7 @@ def fit_gaussians(
 
     training = views.select(fitted)
     hull = visual_hull(training.masks(), training.cameras, settings.hull_resolution, floor)
-    start, spacing = _initial_gaussians(hull, training, settings, generator)
+    start, spacing = initial_gaussians(hull, training.images, training.cameras, settings, generator)
     gains = _Gains(fitted, count, gain_rate, start.means) if gain_rate else None
     fit = _Fit(start, spacing, settings, gains)
 
@@ -245,92 +238,14 @@ def _evaluate(
     gaussians: Gaussians, views: _Views, chosen: list[int], exposures: Tensor | None
 ) -> tuple[float, float]:
     """Mean PSNR [dB] over chosen views with respect to RGBA images over white: full frame, and where alpha > 1/2."""
-    if not chosen:
-        return math.nan, math.nan
-    full, inside = [], []
-    sh = gaussians.sh()
+    sh, errors = gaussians.sh(), []
     for view in chosen:
         exposed = sh if exposures is None else _exposed(sh, exposures[view])
         picture, _ = _render(gaussians, exposed, views.cameras[view])
         rgba = views.images[view]
         error = (picture.clamp(0, 1) - (rgba[..., :3] * rgba[..., 3:] + 1 - rgba[..., 3:])) ** 2
-        full.append(-10 * math.log10(float(error.mean())))
-        inside.append(-10 * math.log10(float(error[rgba[..., 3] > 0.5].mean())))
-    return sum(full) / len(full), sum(inside) / len(inside)
-
-
-def _initial_gaussians(
-    hull: Hull, views: _Views, settings: GaussiansConfig, generator: torch.Generator
-) -> tuple[Gaussians, float]:
-    """Isotropic Gaussians, mostly near the surface of the hull, and their mean spacing [m]."""
-    solid = hull.occupied.float()[None, None]
-    eroded = -torch.nn.functional.max_pool3d(-torch.nn.functional.pad(solid, (1,) * 6), 3, stride=1)
-    shell = hull.occupied & (eroded[0, 0] < 0.5)
-    inner = hull.occupied & ~shell
-    wanted_inside = round(settings.interior * settings.initial_count) if inner.any() else 0
-    wanted = ((shell, settings.initial_count - wanted_inside), (inner, wanted_inside))
-    # a shell voxel represents about one voxel^2 of surface
-    surface_spacing = hull.voxel * math.sqrt(_SHEET_PACKING * float(shell.sum()) / wanted[0][1])
-    volume_spacing = hull.voxel * (_VOLUME_PACKING * float(inner.sum()) / max(wanted_inside, 1)) ** (1 / 3)
-    means, spacings = [], []
-    for (voxels, count), spacing in zip(wanted, (surface_spacing, volume_spacing), strict=True):
-        candidates = voxels.nonzero().to(hull.origin)
-        if count == 0 or len(candidates) == 0:
-            continue
-        picked = _spread(candidates * hull.voxel, count, generator)
-        jitter = torch.rand(len(picked), 3, generator=generator).to(hull.origin)
-        means.append(hull.origin + (candidates[picked] + jitter) * hull.voxel)
-        spacings.append(torch.full((len(picked),), spacing).to(hull.origin))
-    means, spacing = torch.cat(means), torch.cat(spacings)
-    count, higher = len(means), coefficient_count(settings.sh_degree) - 1
-    identity = torch.zeros(count, 4).to(means)
-    identity[:, 0] = 1
-    gaussians = Gaussians(
-        means=means,
-        quats=identity,
-        scales=(_START_SCALE * spacing[:, None]).expand(-1, 3).clone(),
-        opacities=torch.full_like(spacing, settings.initial_opacity),
-        sh0=rgb_to_sh0(_mean_colours(means, views))[:, None],
-        shN=torch.zeros(count, higher, 3).to(means),
-    )
-    return gaussians, surface_spacing
-
-
-def _spread(points: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Indices of about ``count`` points, a random one in each cell of a grid with about that many occupied cells."""
-    if count >= len(points):
-        return torch.arange(len(points), device=points.device)
-    low, high = 0.0, float((points.amax(0) - points.amin(0)).max())
-    shuffled = torch.randperm(len(points), generator=generator).to(points.device)
-    for _ in range(20):
-        size = 0.5 * (low + high)
-        cells = _cell_keys(points, size)
-        low, high = (size, high) if len(torch.unique(cells)) > count else (low, size)
-    cells = _cell_keys(points, high)[shuffled]
-    order = torch.argsort(cells, stable=True)
-    first = torch.ones_like(cells, dtype=torch.bool)
-    first[1:] = cells[order][1:] != cells[order][:-1]
-    return shuffled[order[first]]
-
-
-def _cell_keys(points: Tensor, size: float) -> Tensor:
-    """Integer per point that is equal for points in the same cube of side ``size``."""
-    cells = ((points - points.amin(0)) / size).long()
-    extent = cells.amax(0) + 1
-    return (cells[:, 0] * extent[1] + cells[:, 1]) * extent[2] + cells[:, 2]
-
-
-def _mean_colours(points: Tensor, views: _Views) -> Tensor:
-    """Colour (P, 3) of each point, averaged over the nearest cameras."""
-    pixels, depths = Cameras.joined(views.cameras).project(points)
-    rgba = []
-    for pixel, image in zip(pixels.floor().long(), views.images):
-        column, row = pixel[:, 0].clamp(0, image.shape[1] - 1), pixel[:, 1].clamp(0, image.shape[0] - 1)
-        rgba.append(image[row, column])
-    rgba = torch.stack(rgba)
-    # a point on the surface is occluded in half of the views, but usually not in the nearest ones
-    weights = rgba[..., 3] * torch.softmax(-depths / (_COLOUR_DEPTHS * depths.mean()), dim=0)
-    return (weights[..., None] * rgba[..., :3]).sum(0) / weights.sum(0)[:, None].clamp_min(1e-6)
+        errors.append((error, rgba[..., 3]))
+    return mean_psnr(errors)
 
 
 class _Fit:
@@ -455,7 +370,7 @@ class _Fit:
         """Duplicate each chosen Gaussian. Large ones are shrunk, small ones share the alpha."""
         p = {name: value.clone() for name, value in self.parameters().items()}
         scales = p["scales"][chosen].exp()
-        limit = self.settings.densification.split_scale * self.spacing * _START_SCALE
+        limit = self.settings.densification.split_scale * self.spacing * START_SCALE
         large = scales.amax(dim=1) > limit
         normal = torch.randn(len(chosen), 3, generator=generator).to(scales)
         offsets = (rotations(p["quats"][chosen]) @ (scales * normal)[..., None])[..., 0]
@@ -475,34 +390,3 @@ class _Fit:
             return torch.cat([moment, torch.zeros_like(moment[chosen])])
 
         self._replace({name: torch.cat([p[name], twins[name]]) for name in p}, edit)
-
-
-def image_loss(pictures: Tensor, targets: Tensor, ssim_weight: float) -> Tensor:
-    """(1 - w) L1 + w (1 - SSIM) of (B, H, W, 3) images, as in 3D Gaussian Splatting."""
-    l1 = (pictures - targets).abs().mean()
-    if ssim_weight == 0:
-        return l1
-    return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim_map(pictures, targets).mean())
-
-
-def ssim_map(a: Tensor, b: Tensor, sigma: float = 1.5, radius: int = 5) -> Tensor:
-    """SSIM (B, 3, H, W) of (B, H, W, 3) images in [0, 1]: 11 x 11 Gaussian window, zeros outside.
-
-    The window is applied as two banded matrices by GEMM, which is faster than a small convolution.
-    """
-    a, b = (image.movedim(-1, 1) for image in (a, b))
-    rows, columns = (_window(n, sigma, radius, a.dtype, a.device) for n in a.shape[-2:])
-    maps = rows @ torch.stack([a, b, a * a, b * b, a * b]) @ columns.mT
-    mean_a, mean_b, aa, bb, ab = maps
-    product, squares = mean_a * mean_b, mean_a * mean_a + mean_b * mean_b
-    c1, c2 = 0.01**2, 0.03**2
-    return (2 * product + c1) * (2 * (ab - product) + c2) / ((squares + c1) * (aa + bb - squares + c2))
-
-
-@functools.lru_cache(maxsize=8)
-def _window(size: int, sigma: float, radius: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    positions = torch.arange(size, dtype=torch.float64)
-    offsets = positions[:, None] - positions
-    weights = torch.exp(-(offsets**2) / (2 * sigma**2)) * (offsets.abs() <= radius)
-    full = torch.exp(-(torch.arange(-radius, radius + 1, dtype=torch.float64) ** 2) / (2 * sigma**2)).sum()
-    return (weights / full).to(device, dtype)

@@ -290,8 +290,11 @@ def train_material(
 class _Loop(TrainingLoop):
     """State of the training, and a training step."""
 
+    NAME = "material"
+
     def __init__(self, model, law, videos, settings, log, stretch):
         self.model, self.law, self.videos, self.before = model, law, videos, stretch.before
+        self.model_parts = {"law": law}
         whole = stretch.before + settings.iterations + stretch.after
         self.whole = settings.model_copy(update={"iterations": whole})
         self.settings, self.log = settings, log
@@ -307,10 +310,7 @@ class _Loop(TrainingLoop):
             "elastic": settings.lr_scale * settings.lr_elastic,
             "plastic": settings.lr_scale * settings.lr_plastic,
         }
-        self.optimizer = torch.optim.Adam(
-            [{"params": p, "lr": rates[k], "base_lr": rates[k]} for k, p in self.nets.items() if p],
-            betas=settings.betas,
-        )
+        self.optimizer = self._adam((p, rates[k]) for k, p in self.nets.items() if p)
         memory = stretch.memory or {"averages": {}, "first_loss": None}
         for name, parameter in law.named_parameters():
             if parameter.requires_grad and name in memory["averages"]:
@@ -380,15 +380,7 @@ class _Loop(TrainingLoop):
         if self.settings.zero_gradients:
             self.optimizer.zero_grad(set_to_none=True)
         (weighted / max(self.first_loss, 1e-30)).backward()
-        norms = {}
-        for name, parameters in self.nets.items():
-            if parameters:
-                norm = torch.nn.utils.clip_grad_norm_(parameters, self.settings.gradient_clip)
-                norms[name] = float(norm)
-                if not math.isfinite(norms[name]):
-                    raise NonFiniteError(
-                        "material", f"{name} gradient is not finite at iteration {self.iteration}"
-                    )
+        norms = {name: self._clip_gradients(p, name) for name, p in self.nets.items() if p}
         return norms, float(weighted.detach())
 
     def _weighted(self, losses: Tensor) -> Tensor:
@@ -397,11 +389,9 @@ class _Loop(TrainingLoop):
         return (weights * losses).sum() / weights.sum()
 
     def _step(self) -> None:
-        s, iteration = self.whole, self.before + self.iteration
-        cosine = (1 + math.cos(math.pi * iteration / max(1, s.iterations))) / 2
-        schedule = min(1.0, (iteration + 1) / max(1, s.warm_up)) * (s.lr_floor + (1 - s.lr_floor) * cosine)
-        for group in self.optimizer.param_groups:
-            group["lr"] = group["base_lr"] * self.lr_scale * schedule
+        iteration = self.before + self.iteration
+        warm_up = min(1.0, (iteration + 1) / max(1, self.whole.warm_up))
+        self._set_rates(iteration, self.whole.iterations, warm_up)
         self.optimizer.step()
 
     def memory(self) -> dict[str, Any]:
@@ -411,15 +401,11 @@ class _Loop(TrainingLoop):
         return {"averages": averages, "first_loss": self.first_loss}
 
     def _snapshot(self) -> dict:
-        return {
-            "law": copy.deepcopy(self.law.state_dict()),
-            "optimizer": copy.deepcopy(self.optimizer.state_dict()),
-            "gradients": [None if p.grad is None else p.grad.clone() for p in self._parameters()],
-        }
+        gradients = [None if p.grad is None else p.grad.clone() for p in self._parameters()]
+        return {**super()._snapshot(), "gradients": gradients}
 
     def _restore(self, state: dict) -> None:
-        self.law.load_state_dict(state["law"])
-        self.optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))
+        super()._restore(state)
         for parameter, gradient in zip(self._parameters(), state["gradients"], strict=True):
             # Relevant if gradients are not zeroed. A checkpoint may be from another device.
             parameter.grad = None if gradient is None else gradient.to(parameter, copy=True)

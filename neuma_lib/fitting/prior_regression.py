@@ -47,7 +47,7 @@ _TEST_SEEDS = 30_000
 _TEST_SPEED = 1.25
 """Speed factor of the motions in tests, so that unseen motions stay within the data."""
 _LONGER = 3
-"""Factor of the iterations in a further round, whose data are more diverse."""
+"""Factor of the iterations in an additional round, whose data are more diverse."""
 _WARM_UP = 0.05
 """Share of the iterations in which the learning rate rises."""
 _GRADIENT_CLIP = 1.0

@@ -1,11 +1,11 @@
-"""Common base of training loops: recovery from divergence, and checkpoints."""
+"""Common base of training loops: Adam with a schedule, recovery from divergence, and checkpoints."""
 
 from __future__ import annotations
 
 import copy
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, ClassVar
 
 import torch
@@ -23,6 +23,7 @@ class TrainingLoop(ABC):
         settings: maximum number of recoveries, among others.
         log: receives a line for every recovery.
         optimizer: the optimizer.
+        model_parts: modules by their names in checkpoints, the fitted law or network.
         iteration: number of accepted steps.
         lr_scale: factor on the learning rates after recoveries.
         ended: whether the loop stopped after too many recoveries.
@@ -31,11 +32,19 @@ class TrainingLoop(ABC):
         best: state of the lowest loss, with ``loss`` and ``iteration``.
     """
 
+    NAME: ClassVar[str]
+    """Name of the loop in errors."""
     RETURN: ClassVar[str] = "back to the best state, that of iteration"
 
     settings: TrainingConfig
     log: Callable[[str], None]
     optimizer: Optimizer
+    model_parts: dict[str, torch.nn.Module]
+
+    def _adam(self, groups: Iterable[tuple[Any, float]]) -> Optimizer:
+        """Adam for pairs of parameters and their learning rates."""
+        groups = [{"params": p, "lr": rate, "base_lr": rate} for p, rate in groups]
+        return torch.optim.Adam(groups, betas=self.settings.betas)
 
     def _begin(self, history: Any, first_loss: float | None = None) -> None:
         """Initialise the loop at the end of construction, with the current state as the best one."""
@@ -68,6 +77,21 @@ class TrainingLoop(ABC):
     def advance(self) -> None:
         """One accepted optimiser step, or a return to the best state."""
 
+    def _set_rates(self, iteration: int, iterations: int, factor: float = 1.0) -> None:
+        """Learning rates of an iteration: a cosine from 1 to ``lr_floor``, times a factor and that of recoveries."""
+        floor = self.settings.lr_floor
+        cosine = (1 + math.cos(math.pi * iteration / max(1, iterations))) / 2
+        schedule = factor * (floor + (1 - floor) * cosine)
+        for group in self.optimizer.param_groups:
+            group["lr"] = group["base_lr"] * self.lr_scale * schedule
+
+    def _clip_gradients(self, parameters: list[torch.nn.Parameter], name: str) -> float:
+        """Clip the gradients and return their norm. Raises NonFiniteError."""
+        norm = float(torch.nn.utils.clip_grad_norm_(parameters, self.settings.gradient_clip))
+        if not math.isfinite(norm):
+            raise NonFiniteError(self.NAME, f"{name} gradient is not finite at iteration {self.iteration}")
+        return norm
+
     @abstractmethod
     def _mean_loss(self) -> float:
         """The loss of the current state."""
@@ -82,13 +106,16 @@ class TrainingLoop(ABC):
         except NonFiniteError:
             return
 
-    @abstractmethod
     def _snapshot(self) -> dict[str, Any]:
         """Copies of all values that an optimiser step changes or depends on."""
+        parts = {**self.model_parts, "optimizer": self.optimizer}
+        return {name: copy.deepcopy(part.state_dict()) for name, part in parts.items()}
 
-    @abstractmethod
     def _restore(self, state: dict[str, Any]) -> None:
         """Return to a `_snapshot` without changing it."""
+        for name, module in self.model_parts.items():
+            module.load_state_dict(state[name])
+        self.optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))
 
     def _better_state(self, value: float) -> dict[str, Any]:
         """The current state if its loss is the lowest so far, else the best one."""

@@ -235,7 +235,7 @@ class Method(ABC):
         """Files of the model, for `load`: one path a name."""
 
     def body_inputs(self, case: Case) -> Files:
-        """Further files of `load_initial_state` and `load_reconstruction`: one path a name."""
+        """Additional files of `load_initial_state` and `load_reconstruction`: one path a name."""
         return {}
 
     def uncertainty_inputs(self, case: Case) -> Files:

@@ -28,7 +28,7 @@ class Training:
         inputs: files of `training_inputs`, and those of the method.
         options: as the method got them.
         settings: the same, validated.
-        stamp: further settings that a checkpoint must agree with.
+        stamp: additional settings that a checkpoint must agree with.
     """
 
     def __init__(

@@ -131,25 +131,25 @@ void main() { vec4 c = texture(image, at); result = vec4(c.rgb * c.a, c.a) * 0.9
 
 let gl, programs = {}, buffers = {};
 
-function program(name) {
-  const made = gl.createProgram();
+function link(name) {
+  const program = gl.createProgram();
   ["VERTEX_SHADER", "FRAGMENT_SHADER"].forEach((kind, i) => {
     const shader = gl.createShader(gl[kind]);
     gl.shaderSource(shader, SOURCES[name][i]);
     gl.compileShader(shader);
     if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(`${name}: ${gl.getShaderInfoLog(shader)}`);
-    gl.attachShader(made, shader);
+    gl.attachShader(program, shader);
   });
-  gl.linkProgram(made);
-  if (!gl.getProgramParameter(made, gl.LINK_STATUS)) throw new Error(`${name}: ${gl.getProgramInfoLog(made)}`);
+  gl.linkProgram(program);
+  if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(`${name}: ${gl.getProgramInfoLog(program)}`);
   const uniforms = {};
-  for (const key of ["R", "t", "focal", "centre", "size", "radius", "image"]) uniforms[key] = gl.getUniformLocation(made, key);
-  return { made, uniforms };
+  for (const key of ["R", "t", "focal", "centre", "size", "radius", "image"]) uniforms[key] = gl.getUniformLocation(program, key);
+  return { program, uniforms };
 }
 
 function use(name, camera) {
-  const { made, uniforms } = programs[name];
-  gl.useProgram(made);
+  const { program, uniforms } = programs[name];
+  gl.useProgram(program);
   gl.uniformMatrix3fv(uniforms.R, true, camera.R);
   for (const [key, call] of [["t", "uniform3fv"], ["focal", "uniform2fv"], ["centre", "uniform2fv"], ["size", "uniform2fv"]])
     gl[call](uniforms[key], camera[key]);
@@ -157,13 +157,13 @@ function use(name, camera) {
 }
 
 function attributes(name, array, layout, divisor) {
-  const stride = 4 * layout.reduce((sum, [, width]) => sum + width, 0), { made } = programs[name];
+  const stride = 4 * layout.reduce((sum, [, width]) => sum + width, 0), { program } = programs[name];
   buffers[divisor] = buffers[divisor] || gl.createBuffer();
   gl.bindBuffer(gl.ARRAY_BUFFER, buffers[divisor]);
   gl.bufferData(gl.ARRAY_BUFFER, array, gl.DYNAMIC_DRAW);
   let offset = 0;
   for (const [key, width] of layout) {
-    const place = gl.getAttribLocation(made, key);
+    const place = gl.getAttribLocation(program, key);
     if (place >= 0) {
       gl.enableVertexAttribArray(place);
       gl.vertexAttribPointer(place, width, gl.FLOAT, false, stride, offset);
@@ -176,7 +176,7 @@ function attributes(name, array, layout, divisor) {
 const QUAD = new Float32Array([-1, -1, 1, -1, -1, 1, 1, 1]);
 
 function drawInstances(name, camera, array, layout, count, radius) {
-  const { made, uniforms } = use(name, camera);
+  const { uniforms } = use(name, camera);
   gl.bindVertexArray(gl.createVertexArray());
   const vao = gl.getParameter(gl.VERTEX_ARRAY_BINDING);
   if (radius) gl.uniform1f(uniforms.radius, radius);
@@ -489,10 +489,7 @@ function gaps(left, right) {
 }
 
 function option(select, value, text) {
-  const made = document.createElement("option");
-  made.value = value;
-  made.textContent = text;
-  select.append(made);
+  select.append(new Option(text, value));
 }
 
 function controls() {
@@ -577,7 +574,7 @@ async function main() {
   if (!gl) return fail("This browser has no WebGL 2: update it, or switch hardware acceleration on.");
   if (typeof DecompressionStream === "undefined") return fail("This browser cannot inflate data: update it (2023 or later).");
   data = await inflated();
-  for (const name of Object.keys(SOURCES)) programs[name] = program(name);
+  for (const name of Object.keys(SOURCES)) programs[name] = link(name);
   gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
   shEach = new Frames(data, meta.gaussians.sh).frame(0);
   opacities = new Frames(data, meta.gaussians.opacities).frame(0);

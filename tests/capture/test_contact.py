@@ -4,19 +4,10 @@ import numpy as np
 import pytest
 
 from neuma_lib.capture.motion.contact import contact_time, lowest_points
+from tests.support.board_pictures import looking_at
 
 K = np.array([[400.0, 0, 160], [0, 400, 120], [0, 0, 1]])
 RADIUS = 0.06
-
-
-def camera(eye, target):
-    z = np.subtract(target, eye) / np.linalg.norm(np.subtract(target, eye))
-    x = np.cross(z, [0.0, 1.0, 0.0])
-    x /= np.linalg.norm(x)
-    R = np.stack([x, np.cross(z, x), z])
-    view = np.eye(4)
-    view[:3, :3], view[:3, 3] = R, -R @ eye
-    return view
 
 
 def ball(view, centre):
@@ -31,7 +22,7 @@ def ball(view, centre):
 @pytest.mark.parametrize("height", [0.3, 0.6, 0.9])
 def test_the_lowest_point_of_a_ball_is_found_and_never_too_high(height):
     eye = np.array([0.4, height, 1.2])
-    view = camera(eye, (0.0, 0.15, 0.0))
+    view = looking_at(eye, (0.0, 0.15, 0.0), up=(0.0, 1.0, 0.0))
     centres = np.stack([np.full(9, 0.02), np.linspace(0.3, 0.03, 9), np.full(9, -0.03)], axis=1)
     heights = lowest_points([ball(view, c) for c in centres], centres, view, K)
     off = heights - (centres[:, 1] - RADIUS)

@@ -9,28 +9,17 @@ from neuma_lib.capture.motion.free_fall import Track, fit_flight, fit_free_fall
 from neuma_lib.capture.motion.gravity import GRAVITY, UP, Gravity
 from neuma_lib.capture.motion.timing import row_times
 from neuma_lib.errors import InputError
+from tests.support.board_pictures import looking_at
 from tests.support.errors import refused
 
 X0, V0, A = np.array([0.1, 1.2, 0.0]), np.array([0.4, 0.3, -0.2]), np.array([0.0, -GRAVITY, 0.0])
 K = np.array([[800.0, 0, 320], [0, 800, 240], [0, 0, 1]])
 
 
-def camera(position):
-    position = np.array(position)
-    z = np.array([0.1, 0.8, 0]) - position
-    z /= np.linalg.norm(z)
-    x = np.cross(z, UP)
-    x /= np.linalg.norm(x)
-    R = np.stack([x, np.cross(z, x), z])
-    view = np.eye(4)
-    view[:3, :3], view[:3, 3] = R, -R @ position
-    return view
-
-
 def track(position, offset=0.0, noise=0.0, rng=None, v0=V0, stretch=1.0, count=40):
     t = np.arange(count) / 120
     x = X0 + v0 * t[:, None] + A * t[:, None] ** 2 / 2
-    view = camera(position)
+    view = looking_at(position, (0.1, 0.8, 0), UP)
     p = (x @ view[:3, :3].T + view[:3, 3]) @ K.T
     places = p[:, :2] / p[:, 2:]
     if noise:

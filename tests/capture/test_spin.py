@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from neuma_lib.capture.motion.free_fall import FreeFall, Track
 from neuma_lib.capture.motion.gravity import GRAVITY
+from tests.support.board_pictures import looking_at
 
 pytest.importorskip("cv2")
 
@@ -28,13 +29,7 @@ FALL = FreeFall(
 
 
 def camera(position, times):
-    z = np.array([0, 0.55, 0]) - position
-    z = z / np.linalg.norm(z)
-    x = np.cross(z, (0, 1, 0))
-    x /= np.linalg.norm(x)
-    view = np.eye(4)
-    view[:3, :3] = np.stack([x, np.cross(z, x), z])
-    view[:3, 3] = -view[:3, :3] @ position
+    view = looking_at(position, (0, 0.55, 0), up=(0, 1, 0))
     return Track(times, np.zeros((len(times), 2)), view, K, "a.mp4")
 
 

@@ -9,8 +9,8 @@ from skimage.metrics import structural_similarity
 
 from neuma_lib.config.gaussians import DensificationConfig, GaussiansConfig
 from neuma_lib.errors import InputError
-from neuma_lib.fitting import gaussians as fitting
 from neuma_lib.fitting.gaussians import fit_gaussians
+from neuma_lib.fitting.image_quality import ssim_map
 from neuma_lib.geometry.visual_hull import visual_hull
 from neuma_lib.splatting.spherical_harmonics import coefficient_count
 from tests.support import raycast
@@ -111,7 +111,7 @@ def test_ssim_equals_skimage():
         data_range=1.0, channel_axis=-1, full=True,
     )  # fmt: skip
     inner = (slice(5, -5), slice(5, -5))  # where no window leaves the image
-    actual = fitting.ssim_map(a, b)[0].movedim(0, -1).numpy()
+    actual = ssim_map(a, b)[0].movedim(0, -1).numpy()
     assert np.abs(actual[inner] - expected[inner]).max() < 1e-9
 
 

@@ -1,4 +1,4 @@
-"""Family and constants found in a video whose truth is known: one of the candidates, as seen, and as uncertain."""
+"""Identification of family and constants in videos with a known truth, and its uncertainty."""
 
 import math
 from dataclasses import replace
@@ -12,9 +12,10 @@ from neuma_lib.config.laws import LawConfig
 from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.errors import NonFiniteError
 from neuma_lib.fitting.families import Family
+from neuma_lib.fitting.family_run import FamilyRun
 from neuma_lib.fitting.frame_batches import first_contact
 from neuma_lib.fitting.identified import FamilyFit
-from neuma_lib.fitting.identify import _better_later, _prune, _Run, _select, identify
+from neuma_lib.fitting.identify import _better_later, _prune, _select, identify
 from neuma_lib.fitting.least_squares import Linearisation, jackknife, levenberg_marquardt
 from neuma_lib.fitting.video_residuals import VideoResiduals, averaged
 from neuma_lib.io.files import write_json
@@ -88,25 +89,27 @@ def test_constants_and_family_of_the_truth_are_identified():
     assert identified.as_dict()["law"]["plasticity"] == {"name": "identity"}
 
 
-def test_first_frames_that_mislead_are_not_where_the_last_fit_begins(monkeypatch):
-    """All frames are fitted through all squares, from guesses too, if the last ones are predicted far worse, as those
-    of a plastic body by an elastic one."""
-    begun, begin = [], _Run.begin
+def test_the_last_fit_does_not_start_from_misleading_first_frames(monkeypatch):
+    """All frames are fitted at all levels, also from guesses, if the last ones are predicted far worse, as those of a
+    plastic body by an elastic one."""
+    calls, begin = [], FamilyRun.begin
 
-    def noted(run, starts, level=0, *args, **options):
-        begun.append((len(starts), level))
+    def recorded(run, starts, level=0, *args, **options):
+        calls.append((len(starts), level))
         begin(run, starts, level, *args, **options)
 
-    monkeypatch.setattr(_Run, "begin", noted)
+    monkeypatch.setattr(FamilyRun, "begin", recorded)
     truth = law("hencky", "von_mises", E=6e4, nu=0.3, yield_stress=2e3)
     for factor, expected in ((1e6, (1, len(SQUARES) - 1)), (1.2, (3, 0))):
         assert identified_in(truth, {"hencky": ELASTIC}, prune_factor=factor).best.refined
-        assert begun[-1] == expected
+        assert calls[-1] == expected
 
 
 def test_an_uncertain_motion_is_corrected_and_widens_the_constants():
-    """A velocity that is off by a standard deviation along all axes is found to a third of that, and the constants as
-    well as with the true one; what is left of the uncertainty is passed on to them."""
+    """A velocity with an error of one standard deviation along all axes is corrected to a third of that.
+
+    The constants are as accurate as with the true velocity, and receive the remaining uncertainty.
+    """
     truth, families = law("hencky", E=3e4, nu=0.35), {"hencky": ELASTIC}
     off, std = np.array([0.03, -0.03, 0.06]), (0.03, 0.03, 0.06, 0.2, 0.2, 0.2)
     motion = known(ball(), std)
@@ -145,7 +148,7 @@ def test_two_videos_have_the_constants_in_common_and_a_motion_each():
 
 
 def test_videos_count_alike_however_long():
-    """The same video again, in half as many frames: the loss is the mean of both, what is found the same."""
+    """The same video again, in half as many frames: the loss is the mean of both, the estimate is the same."""
     families, truth = {"hencky": ELASTIC}, law("hencky", E=3e4, nu=0.4)
     options = dict(pyramid=(8, 32), frames=33)
     body, half = video_of(truth, V0, FRAMES[::2])
@@ -178,8 +181,8 @@ def test_what_many_particles_change_is_added_and_its_scatter_is_uncertainty():
     seen, motion = observe(many, V0, FRAMES, truth), known(many)
     options = settings(families, covariance_from="elastic")
     results = [
-        identify(MODEL, motion, few, seen, options, refined=[finer] if finer else ()).best
-        for finer in ((), (filled(3000), filled(3000)))
+        identify(MODEL, motion, few, seen, options, refined=[resampled] if resampled else ()).best
+        for resampled in ((), (filled(3000), filled(3000)))
     ]
     errors = [abs(math.log(fit.values["E"] / 3e4)) for fit in results]
     assert errors[1] < errors[0] / 2
@@ -204,8 +207,8 @@ def test_a_motion_is_read_moved_and_written():
     np.testing.assert_allclose(moved.of_body(body).v, moved.velocity + around)
 
 
-class Begun:
-    """A fit as `_prune` sees it: its squared residuals, its family, and the picture that it shows."""
+class FakeRun:
+    """The attributes of a fit that `_prune` reads: squared residuals, family, and an image."""
 
     alive = True
 
@@ -217,26 +220,26 @@ class Begun:
         return self.picture == other.picture
 
 
-def test_families_are_left_that_are_far_behind_or_show_what_one_within_them_shows():
-    """What is merely no better in blurred images stays: with more constants, of another elasticity, or flowing where a
-    body within it as soft as to lie flat does as well."""
+def test_families_with_a_high_cost_and_redundant_ones_are_pruned():
+    """Families that are merely no better in blurred images are kept, with more constants, of another elasticity, or
+    with flow that a contained soft body also reproduces."""
     options = settings({"hencky": ELASTIC}, prune_factor=3.0)
-    elastic, far = Begun(1.0, ELASTIC, "soft"), Begun(3.1, law("neo_hookean"), "far")
-    never_yields, flat = Begun(0.99, PLASTIC, "soft"), Begun(1.2, FLUID, "flat")
-    sibling = Begun(1.0, law("fixed_corotated"), "soft")
+    elastic, far = FakeRun(1.0, ELASTIC, "soft"), FakeRun(3.1, law("neo_hookean"), "far")
+    never_yields, flat = FakeRun(0.99, PLASTIC, "soft"), FakeRun(1.2, FLUID, "flat")
+    sibling = FakeRun(1.0, law("fixed_corotated"), "soft")
     runs = [elastic, far, never_yields, flat, sibling]
     _prune(runs, options)
     assert [run.alive for run in runs] == [True, False, False, True, True]
-    grains = Begun(1.0, law("hencky", "drucker_prager", friction_angle=30), "soft")
+    grains = FakeRun(1.0, law("hencky", "drucker_prager", friction_angle=30), "soft")
     _prune([elastic, grains], options)
     assert grains.alive, "sand does not contain the elastic body"
 
 
-def test_fits_learn_of_better_ones_that_began_later():
-    """Of the best of all, and of the best one of the same constants: a flow may lead with constants that no elastic
-    body bears."""
-    stuck, elastic = Begun(9.0, ELASTIC, "stuck"), Begun(2.0, law("fixed_corotated"), "soft")
-    worse, flow = Begun(3.0, law("neo_hookean"), "soft"), Begun(1.0, PLASTIC, "flows")
+def test_fits_restart_from_better_ones_that_started_later():
+    """From the best of all, and the best one with the same constants, since a flow may lead with constants that suit no
+    elastic body."""
+    stuck, elastic = FakeRun(9.0, ELASTIC, "stuck"), FakeRun(2.0, law("fixed_corotated"), "soft")
+    worse, flow = FakeRun(3.0, law("neo_hookean"), "soft"), FakeRun(1.0, PLASTIC, "flows")
     pairs = _better_later([stuck, elastic, worse, flow])
     assert pairs == [(stuck, flow), (stuck, elastic), (elastic, flow), (worse, flow)]
     stuck.alive = flow.alive = False
@@ -248,7 +251,9 @@ def test_a_flow_that_never_yields_shows_the_elastic_body():
     body, seen = video_of(ELASTIC, V0, FRAMES)
     chosen = settings({"hencky": ELASTIC}, covariance_from="elastic", refined_particles=0)
     video = VideoResiduals(MODEL, known(body), body, seen, chosen)
-    runs = [_Run(Family("x", spec), [video], [len(FRAMES)], chosen) for spec in (ELASTIC, PLASTIC, PLASTIC)]
+    runs = [
+        FamilyRun(Family("x", spec), [video], [len(FRAMES)], chosen) for spec in (ELASTIC, PLASTIC, PLASTIC)
+    ]
     for run, limit in zip(runs, (1.0, 1e5, 1e3), strict=True):
         values = run.family.with_guesses({"yield_stress": limit})
         run._origin = run.family.unbounded(values)
@@ -289,7 +294,7 @@ def test_a_plateau_widens_what_is_not_determined(flat):
     """Squared residuals that rise so many times less on one side than their quadratic: so much larger is the variance,
     up to that of the spread. A determined axis costs no simulation."""
     chosen, curvature = settings({"hencky": ELASTIC}, spread=2.0, determined=0.1), np.diag([1e4, 5.0])
-    run = _Run(Family("hencky", ELASTIC), [None], [0], chosen)
+    run = FamilyRun(Family("hencky", ELASTIC), [None], [0], chosen)
     run.fit, tried = Linearisation(np.pad(curvature, (0, 9))[None], np.zeros((1, 11)), 1.0, 1.0), []
     run._covariance = lambda: np.diag([1e-4, 0.25] + [0.0] * 9)
 
@@ -390,7 +395,7 @@ def test_stiffness_that_the_time_step_does_not_bear_has_a_difference_too():
     body, seen = video_of(ELASTIC, V0, FRAMES)
     chosen = settings({"hencky": ELASTIC}, covariance_from="elastic", refined_particles=0)
     video, family = VideoResiduals(MODEL, known(body), body, seen, chosen), Family("hencky", ELASTIC)
-    run = _Run(family, [video], [len(FRAMES)], chosen)
+    run = FamilyRun(family, [video], [len(FRAMES)], chosen)
     run._origin = family.unbounded({"E": 1e9, "nu": 0.3})
     run._u[0] = math.log(run.values["E"] / 1e9) + 0.5  # beyond the limit by more than a small step
     here = run._residual(run._u)

@@ -17,6 +17,7 @@ from neuma_lib.mechanics.neural import neural_law
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 from tests.support.errors import refused
+from tests.support.gradients import check_directional_derivatives
 from tests.support.grounding_scene import MODEL, ball, camera, observe
 from tests.support.training import FRAMES, V0, MemoryCheckpoint, stiff_random_law
 
@@ -32,30 +33,17 @@ def problem():
 def test_gradient_from_adaptor_to_image_loss(problem):
     body, loss = problem
     law = stiff_random_law()
-    parameters = [p for p in law.parameters() if p.requires_grad]
+    parameters = {name: p for name, p in law.named_parameters() if p.requires_grad}
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():  # away from B = 0, where A has no gradient
-        for p in parameters:
+        for p in parameters.values():
             p.add_(0.05 * torch.randn(p.shape, generator=generator, dtype=p.dtype))
 
     def value():
         path = rollout(MODEL, law, body.state(V0), steps=60, frames=FRAMES)
         return loss(path).mean()
 
-    grads = torch.autograd.grad(value(), parameters)
-    direction = [torch.randn(p.shape, generator=generator, dtype=p.dtype) for p in parameters]
-    slope = sum(float((g * d).sum()) for g, d in zip(grads, direction, strict=True))
-    h = 1e-6
-    values = []
-    for sign in (1, -1):
-        with torch.no_grad():
-            for p, d in zip(parameters, direction, strict=True):
-                p.add_(sign * h * d)
-            values.append(float(value()))
-            for p, d in zip(parameters, direction, strict=True):
-                p.sub_(sign * h * d)
-    assert slope != 0
-    assert (values[0] - values[1]) / (2 * h) == pytest.approx(slope, rel=1e-5)
+    check_directional_derivatives(value, parameters, generator, each=False, rel=1e-5)
 
 
 SETTINGS = TrainingConfig(iterations=12, lr_elastic=0.02, lr_plastic=0.002, checkpoint_every=3)
@@ -204,7 +192,7 @@ def test_the_setting_of_the_adjoint_reaches_both_networks(problem):
     assert [part.adjoint_precision for part in parts] == ["half", "half"]
     assert (
         law.elasticity.graph_key() != stiff_random_law().elasticity.graph_key()
-    )  # graphs are recorded apart
+    )  # graphs are recorded separately
 
 
 def test_nothing_to_train_is_an_input_error(problem):

@@ -163,7 +163,7 @@ def test_a_step_over_views_of_several_sizes_is_their_mean(duck):
 
 
 def test_exposures_that_were_put_in_are_recovered(duck, plain):
-    """Down to half as bright, in three channels apart: less than a third of it is left, and held-out views are as good.
+    """Down to half as bright, independently per channel: less than a third remains, and held-out views are as good.
 
     What is left is shading that few Gaussians draw coarsely: the views from above are the brighter ones.
     """

@@ -342,9 +342,11 @@ def test_unlike_cameras_identify_the_truth(compare):
 
 
 def test_motion_blur_that_is_rendered_does_not_bias_the_stiffness():
-    """A fall of 3 m/s, every picture exposed for half of the time until the next: with a render at every second step of
-    the exposure the stiffness is found to 0.2 %; as if pictures were instants, five times worse at least, and what is
-    left unexplained is a hundred times larger."""
+    """A fall of 3 m/s, with images exposed for half of the time until the next.
+
+    With a render at every second step of the exposure, the stiffness is estimated to 0.2 %. With instantaneous images,
+    its error is at least five times and the residual a hundred times larger.
+    """
     body, v0, frames = ball(), (0.5, -3.0, 0.0), tuple(range(16, 105, 16))
     seen = filmed(body, blank(camera(24), frames, *exposed_steps(8.0, 99)), law(), v0)
     steps, shares = exposed_steps(8.0, 5)

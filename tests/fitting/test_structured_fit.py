@@ -1,6 +1,5 @@
 """Which parts of a structured law are corrected, and that the others stay unchanged."""
 
-import copy
 from itertools import pairwise
 
 import pytest
@@ -25,6 +24,7 @@ from neuma_lib.mechanics.structured import structured_law
 from neuma_lib.sim.rollout import rollout
 from tests.support.errors import refused
 from tests.support.grounding_scene import MODEL, TRUTH, ball, observe
+from tests.support.training import MemoryCheckpoint
 
 FRAMES = (0, 50, 60, 70, 80, 90, 100, 110)  # it touches the ground at about 50
 V0 = torch.tensor([0.0, -1.5, 0.0], dtype=torch.float64)
@@ -64,7 +64,7 @@ def too_stiff(problem):
     return trained, choice, messages, states
 
 
-def test_the_part_that_gains_is_corrected_and_the_other_stays_exactly(too_stiff):
+def test_only_the_part_that_improves_is_corrected(too_stiff):
     trained, choice, messages, states = too_stiff
     assert choice.parts == ("elastic",)
     assert set(choice.trials) == {"nothing", "elastic", "plastic", "elastic + plastic"}
@@ -116,7 +116,7 @@ def test_a_training_in_two_stretches_is_the_whole(problem):
 
 
 def test_a_correction_may_stiffen_beyond_the_limit_where_training_may_begin(problem):
-    """Constants found at the edge of what the time step bears are corrected upwards, too."""
+    """Constants at the stiffness limit of the time step can also be corrected upwards."""
     body, loss = problem
     density, spec = float(body.state(V0).density.min()), {"elasticity": FLOWS["elasticity"]}
     number = MODEL.courant(structured_law(spec, MODEL.dt).double(), density)
@@ -135,7 +135,7 @@ def test_a_correction_may_stiffen_beyond_the_limit_where_training_may_begin(prob
 
 @pytest.mark.parametrize("viscosity", [20.0, 60.0])
 def test_the_first_step_on_a_fluid_that_is_too_viscous_lowers_the_loss(viscosity):
-    """It also gives the fluid a yield stress and lets its volume go, which must not undo what it gains."""
+    """It also adds a yield stress and changes the volume response, which must not cancel the improvement."""
     body, elasticity = ball(), {"name": "hencky", "E": 5e4, "nu": 0.3}
 
     def spec(factor):
@@ -151,7 +151,7 @@ def test_the_first_step_on_a_fluid_that_is_too_viscous_lowers_the_loss(viscosity
     assert second < first and not trained.history.recoveries
 
 
-def test_a_law_that_nothing_improves_stays_exactly_as_it_is(problem):
+def test_a_law_that_nothing_improves_is_unchanged(problem):
     """The video is that of the law itself."""
     trained, choice = fit(problem, TRUTH, log=lambda _: None)
     assert choice.parts == () and set(choice.trials) == {"nothing", "elastic"}
@@ -159,26 +159,10 @@ def test_a_law_that_nothing_improves_stays_exactly_as_it_is(problem):
     assert trained.stable and len(trained.history.loss) == 1 and trained.summary()
 
 
-class KilledAfter:
-    """A checkpoint in memory whose run is killed as it has saved so many states."""
-
-    def __init__(self, saves):
-        self.states, self.left = [], saves
-
-    def load(self):
-        return copy.deepcopy(self.states[-1]) if self.states else None
-
-    def save(self, state):
-        self.states.append(copy.deepcopy(state))
-        self.left -= 1
-        if self.left == 0:
-            raise KeyboardInterrupt
-
-
 @pytest.mark.parametrize("saves", [1, 2, 4])
-def test_a_killed_run_goes_on_to_the_same_bits(problem, too_stiff, saves):
+def test_an_interrupted_run_resumes_to_the_same_bits(problem, too_stiff, saves):
     """In the trial, at its end, in the last training."""
-    keep = KilledAfter(saves)
+    keep = MemoryCheckpoint(fail_after=saves)
     with pytest.raises(KeyboardInterrupt):
         fit(problem, FLOWS, log=lambda _: None, checkpoint=keep)
     before = len(keep.states)
@@ -209,7 +193,7 @@ CLOSER = {**FLOWS, "elasticity": {**TRUTH["elasticity"], "E": 3.5e4}}
 
 
 def test_a_rival_whose_correction_does_better_takes_the_place_of_the_law(problem):
-    """Both may flow and do not; one is nearer to the stiffness of the video."""
+    """Both have a yield stress that is not reached. One is nearer to the stiffness of the video."""
     done = []
     trained, choice = fit(
         problem, FLOWS, CLOSER, log=lambda _: None, progress=lambda *state: done.append(state[:2])
@@ -232,8 +216,8 @@ def test_a_rival_that_does_worse_changes_nothing(problem):
 
 
 @pytest.mark.parametrize("saves", [2, 3, 5, 6])
-def test_a_killed_run_with_a_rival_goes_on(problem, saves):
-    never, keep = KilledAfter(100), KilledAfter(saves)
+def test_an_interrupted_run_with_a_rival_resumes(problem, saves):
+    never, keep = MemoryCheckpoint(), MemoryCheckpoint(fail_after=saves)
     whole, choice = fit(problem, FLOWS, CLOSER, log=lambda _: None, checkpoint=never)
     with pytest.raises(KeyboardInterrupt):
         fit(problem, FLOWS, CLOSER, log=lambda _: None, checkpoint=keep)
@@ -250,7 +234,7 @@ def test_a_rival_has_to_gain_the_margin_too():
     assert _select(candidates, trials, 0.1) == (1, ("elastic",))
 
 
-def test_rivals_are_ties_that_flow_otherwise_the_best_first():
+def test_rivals_are_ties_with_other_return_maps_the_best_first():
     def law(flow):
         return {"elasticity": {"name": "hencky"}, "plasticity": {"name": flow}}
 
@@ -264,8 +248,8 @@ def test_rivals_are_ties_that_flow_otherwise_the_best_first():
     assert rival_bases(results, 0) == [] == rival_bases({**results, "ties": []}, 1)
 
 
-def test_the_largest_penalty_that_held_out_frames_bear_is_taken(problem):
-    """A crushing weight leaves the law at its base, which these frames do not bear."""
+def test_the_largest_penalty_with_a_similar_held_out_loss_is_selected(problem):
+    """A very large weight leaves the law at its base, which does not fit these frames."""
     messages = []
     structured = STRUCTURED.model_copy(update={"penalties": (1e-9, 1e9)})
     spec = {"elasticity": FLOWS["elasticity"]}
@@ -293,8 +277,8 @@ def test_some_frames_of_a_loss_are_those_of_the_loss(problem):
 @pytest.mark.parametrize("blocks", [1, 2, 4, 50])
 @pytest.mark.parametrize("count", [4, 7, 33, 400])
 @pytest.mark.parametrize("share", [0.01, 0.25, 0.9])
-def test_frames_that_decide_end_every_part_of_what_follows_the_contact(blocks, count, share, contact):
-    """They are about the share of all, the last frame is among them, the first is not, and every part keeps some."""
+def test_held_out_frames_end_each_block_after_the_contact(blocks, count, share, contact):
+    """They are about the given share, include the last frame but not the first, and leave some frames in each block."""
     held_out = held_out_frames(count, share, blocks, contact)
     first = contact if contact < count - 1 else 0
     parts = min(blocks, (count - first) // 2)

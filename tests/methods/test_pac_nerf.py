@@ -54,7 +54,7 @@ def body(settings=SMALL):
 
 
 def film(carried, spec):
-    """The video of a body with this law, launched with V0; its own particles move."""
+    """The video of a body with this law, launched with V0. The particles of the field move."""
     return benchmark.film(carried.field, carried.rendered, spec, FRAMES, benchmark.cameras(24, torch.float64))
 
 
@@ -111,7 +111,7 @@ def test_gradient_of_constants_and_velocity_against_differences(family, carried)
 
 
 class TestMemory:
-    """Pictures are rendered in pieces, and stay bytes until they are compared."""
+    """Images are rendered in pieces, and remain bytes until they are compared."""
 
     @staticmethod
     def video(carried, size):
@@ -133,11 +133,11 @@ class TestMemory:
         return float(error.detach()), x.grad, kept[0]
 
     def test_a_picture_in_pieces_has_the_same_loss_and_gradient(self, carried, monkeypatch):
-        video, result = Video(self.video(carried, 24)), []
+        video, results = Video(self.video(carried, 24)), []
         for most in (10**9, 300, 1):
             monkeypatch.setitem(rendering.POINTS_AT_ONCE, "cpu", most)
-            result.append([*self.error(carried, video)[:2], carried.field.draw(video.views[0].cameras, 0)])
-        (loss, gradient, picture), *others = result
+            results.append([*self.error(carried, video)[:2], carried.field.draw(video.views[0].cameras, 0)])
+        (loss, gradient, picture), *others = results
         assert loss > 1e-4 and gradient.abs().max() > 1e-6
         for other in others:
             assert other[0] == pytest.approx(loss, rel=1e-12)
@@ -190,8 +190,8 @@ def test_poissons_ratio_is_recovered(elastic):
 
 
 def test_poissons_ratio_waits_for_the_modulus(elastic):
-    result = elastic.history.constants["nu"]
-    assert set(result[: SMALL.iterations_contact + 1]) == {result[0]} and result[-1] != result[0]
+    curve = elastic.history.constants["nu"]
+    assert set(curve[: SMALL.iterations_contact + 1]) == {curve[0]} and curve[-1] != curve[0]
 
 
 @pytest.mark.slow
@@ -200,9 +200,9 @@ def test_constants_of_every_family_are_recovered_from_its_published_guess(name, 
     """With default settings, within the bounds of docs/systems.md; see benchmarks/pac_nerf.py."""
     settings = loaded.pac_nerf.model_copy(update=benchmark.SMALL)
     fit = benchmark.recover(name, settings.families[name], settings, log=lambda _: None)
-    result = fit.constants.fitted_numbers()
+    fitted = fit.constants.fitted_numbers()
     for key, bound in BOUNDS[name].items():
-        assert benchmark.error(key, benchmark.TRUTHS[name][key], result[key]) < bound
+        assert benchmark.error(key, benchmark.TRUTHS[name][key], fitted[key]) < bound
 
 
 def test_resumes_bit_for_bit(carried, tmp_path):
@@ -239,15 +239,15 @@ def test_resumes_bit_for_bit(carried, tmp_path):
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_cuda_agrees(carried):
     short = SMALL.model_copy(update=dict(velocity_iterations=2, iterations_contact=0, iterations_all=2))
-    video, result = film(carried, changed(ELASTIC, E=1e5)), []
+    video, results = film(carried, changed(ELASTIC, E=1e5)), []
     for device in ("cpu", "cuda"):
         own = CarriedField(ball().to(device), 1.0, 1e-3, short, 1000.0)
         seen = video.to(torch.float64, device)
         fit = fit_pac_nerf(
             MODEL, own, seen, contact(carried), FamilyConstants(ELASTIC), short, log=lambda _: None
         )
-        result.append([*fit.velocity.tolist(), *fit.history.loss, *fit.history.constants["E"]])
-    assert result[1] == pytest.approx(result[0], rel=1e-5)
+        results.append([*fit.velocity.tolist(), *fit.history.loss, *fit.history.constants["E"]])
+    assert results[1] == pytest.approx(results[0], rel=1e-5)
 
 
 def test_steps_are_halved_where_a_law_is_too_stiff(carried):
@@ -344,7 +344,7 @@ def test_frames_are_spread_evenly():
 
 
 class TestOwnParticles:
-    """The row that is evaluated on the particles that carry the field, and its pictures."""
+    """The preset that is evaluated on the particles of the field, and its images."""
 
     CAMERAS = benchmark.cameras(24, torch.float64)
 
@@ -392,7 +392,7 @@ class TestOwnParticles:
         assert len(list(renderer.batches(x, F))) == 3
 
     def test_its_own_particles_make_the_video_that_it_was_fitted_to(self, carried):
-        """The loss that fitting sees is that of these pictures: own law, own motion and own particles."""
+        """The loss of the fit equals that of these images, with the fitted law, initial motion and particles."""
         spec = changed(ELASTIC, E=1e5)
         law = FamilyConstants(ELASTIC, {"E": 1e5}).law(MODEL.dt)
         video, k = film(carried, spec), len(FRAMES) - 1

@@ -10,6 +10,7 @@ from neuma_lib.errors import NonFiniteError
 from neuma_lib.methods.spring_gaus.network import SpringNetwork, Springs, farthest_points
 from neuma_lib.methods.spring_gaus.rollout import MAX_SUBSTEPS, SpringModel, spring_rollout
 from tests.support.errors import refused
+from tests.support.gradients import check_directional_derivatives
 
 pytestmark = pytest.mark.core
 
@@ -103,17 +104,7 @@ def test_gradients_agree_with_differences(exponent):
         return (weights[0] * x).sum() + 0.1 * (weights[1] * v).sum()
 
     inputs = {"x": x0, "v": v0, **dict(springs.named_parameters())}
-    grads = dict(zip(inputs, torch.autograd.grad(value(), list(inputs.values())), strict=True))
-    for name, tensor in inputs.items():
-        direction = torch.randn(tensor.shape, generator=generator, dtype=torch.float64)
-        h, values = 1e-6, []
-        for sign in (1, -2, 1):
-            with torch.no_grad():
-                tensor += sign * h * direction
-                values.append(float(value()))
-        slope = (values[0] - values[1]) / (2 * h)
-        assert float((grads[name] * direction).sum()) == pytest.approx(slope, rel=2e-6, abs=1e-8), name
-        assert abs(slope) > 1e-3, name
+    check_directional_derivatives(value, inputs, generator, floor=1e-3, rel=2e-6, abs=1e-8)
 
 
 def test_gradient_of_a_part_of_the_video_sees_only_its_own_steps():

@@ -22,6 +22,7 @@ from neuma_lib.methods.spring_gaus.rollout import SpringModel, spring_rollout
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.splatting.observation import Observation
 from tests.support.errors import refused
+from tests.support.gradients import check_directional_derivatives
 from tests.support.grounding_scene import MODEL, TRUTH, ball, camera, observe
 
 FRAMES = tuple(range(0, 91, 5))
@@ -87,17 +88,7 @@ def test_gradient_from_springs_to_image_loss(small):
         x, v, _ = spring_rollout(BOX, springs, *small.anchored.start(small.start), small.loss.frames)
         return small.loss(small.anchored.path(small.loss.frames, x, v)).mean()
 
-    grads = dict(zip(parameters, torch.autograd.grad(value(), list(parameters.values())), strict=True))
-    for name, p in parameters.items():
-        direction = torch.randn(p.shape, generator=generator, dtype=p.dtype)
-        h, values = 1e-6, []
-        for step in (1, -2, 1):
-            with torch.no_grad():
-                p += step * h * direction
-                values.append(float(value()))
-        slope = (values[0] - values[1]) / (2 * h)
-        assert slope != 0
-        assert float((grads[name] * direction).sum()) == pytest.approx(slope, rel=1e-4, abs=1e-9), name
+    check_directional_derivatives(value, parameters, generator, rel=1e-4, abs=1e-9)
 
 
 def test_motion_of_springs_is_recovered_to_a_millimetre(problem):

@@ -35,7 +35,7 @@ def plan(project):
 def test_the_report_plans_every_stage_once(plan):
     planned = plan.behind(REPORT.format(method="neuma_structured"))
     once = ("poses", "room", "photograph_masks", "curves", "images", "report")
-    takes = ("flight", "registration", "video", "shown")
+    takes = ("flight", "registration", "video", "display")
     expected = {f"capture_{name}": 1 for name in once} | {f"capture_{name}": 3 for name in takes}
     expected |= {"capture_frames": 6, "capture_video_masks": 6}
     expected |= {"predict": 9, "capture_view": 18}  # the prior, the constants, and the law

@@ -446,7 +446,7 @@ def test_motions_of_springs_and_of_experiments_are_exported_too(plan):
         ),
         (
             [f"{SCENE}/pac_nerf_own/export/gaussians"],
-            "it is evaluated on particles of its own fit, which only scenes with rendered videos have. Choose pac_nerf",
+            "it is evaluated on the particles of its fit, which only scenes with rendered videos have. Choose pac_nerf",
         ),
         ([f"{RESULTS}/figures/i23d.png"], "no scene has a splat"),
     ],

@@ -106,7 +106,7 @@ class TestThisProject:
 
     @pytest.mark.parametrize(
         "script",
-        ["ground_truth", "prior", "sampled_particles", "render_static", "render_dynamic", "chamfer_table"],
+        ["ground_truth", "prior", "sampled_particles", "render", "chamfer_table"],
     )
     def test_what_does_not_render_is_free_of_it(self, script):
         assert "neuma_lib.splatting.rasterizer" not in self.reached(script)
@@ -127,7 +127,8 @@ def jobs_with_code(finished, loaded):
     for job in Plan.of(finished.output).jobs:
         wildcards = dict(word.split("=", 1) for word in job.listed("wildcards"))
         folder, name = ("kernels", wildcards["group"]) if job.rule == "kernels" else ("scripts", job.rule)
-        script = Path("workflow", folder, f"{'fit' if name.startswith('fit_') else name}.py")
+        shared = [script for script in ("fit", "render") if name.startswith(f"{script}_")]
+        script = Path("workflow", folder, f"{(shared or [name])[0]}.py")
         method = wildcards.get("method")
         modules = (type(cases.kind_of(loaded, method)).__module__,) if method else ()
         record = base64.urlsafe_b64encode(job.outputs[0].encode()).decode()

@@ -14,6 +14,6 @@ rule binding:
     params:
         binding=SETTINGS.binding.plain(),
         # a splat may be bound to the sampled particles alone
-        own_particles=splat_setting(lambda scene: scene.splat.own_particles if scene.splat else True),
+        own_particles=of_section(lambda scene: scene.splat.own_particles if scene.splat else True),
     script:
         "../scripts/binding.py"

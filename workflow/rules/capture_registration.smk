@@ -25,7 +25,7 @@ rule capture_registration:
     wildcard_constraints:
         scene=TAKE_SCENE,
     params:
-        cameras=lambda wildcards: SETTINGS.scene(wildcards.scene).captured.cameras,
+        cameras=scene_cameras,
         timing=camera_timing,
         name="{scene}",
     script:

@@ -1,9 +1,9 @@
 """Comparison of predictions with the videos of takes, and the report of a capture. Needs capture_motion.smk."""
 
-SHOWN = f"{DATA}/{{scene}}/shown/transforms.json"
+DISPLAY = f"{DATA}/{{scene}}/shown/transforms.json"
 
 
-rule capture_shown:
+rule capture_display:
     input:
         videos=TAKE_VIDEOS,
         mattes=of_take_cameras(MATTES),
@@ -12,7 +12,7 @@ rule capture_shown:
         room=captured_file(f"{DATA}/{{capture}}/room/transforms.json"),
         report=captured_file(f"{RESULTS}/{{capture}}/room.json"),
     output:
-        transforms=SHOWN,
+        transforms=DISPLAY,
     wildcard_constraints:
         scene=OWN_TAKE,
     conda:
@@ -23,17 +23,17 @@ rule capture_shown:
         longest=capture_setting("longest"),
         width=SETTINGS.captures.shown,
     script:
-        "../scripts/capture_shown.py"
+        "../scripts/capture_display.py"
 
 
-rule released_shown:
+rule released_display:
     input:
         folders=RELEASED_FOLDERS,
         mattes=of_take_cameras(MATTES),
         dynamic=f"{DATA}/{{scene}}/dynamic/transforms.json",
         registration=f"{RESULTS}/{{scene}}/registration.json",
     output:
-        transforms=SHOWN,
+        transforms=DISPLAY,
     wildcard_constraints:
         scene=RELEASED_TAKE,
     conda:
@@ -45,7 +45,7 @@ rule released_shown:
         longest=capture_setting("longest"),
         width=SETTINGS.captures.shown,
     script:
-        "../scripts/released_shown.py"
+        "../scripts/released_display.py"
 
 
 rule capture_view:
@@ -53,7 +53,7 @@ rule capture_view:
         **body_files(),
         kernels=kernels("rendering"),
         weights=f"{DATA}/weights/lpips.safetensors",
-        shown=SHOWN,
+        display=DISPLAY,
         rollout=f"{RESULTS}/{{scene}}/{{method}}/rollout.h5",
         prior=prior_rollout,
     output:
@@ -67,7 +67,7 @@ rule capture_view:
         view=scene_view,
         title=lambda wildcards: report_titles(wildcards.method)[wildcards.method].partition(",")[0],
         density=scene_setting("density"),
-        carrier=of_bodies(shared_carrier),
+        particle_source=of_bodies(shared_particle_source),
         gaussian_motion=gaussian_motion,
         prior_motion=lambda wildcards: (
             gaussian_motion(SimpleNamespace(scene=wildcards.scene, method=PRIOR)) if PRIOR else None

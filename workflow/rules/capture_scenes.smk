@@ -11,7 +11,7 @@ rule capture_video:
     wildcard_constraints:
         scene=TAKE_SCENE,
     params:
-        cameras=lambda wildcards: SETTINGS.scene(wildcards.scene).captured.cameras,
+        cameras=scene_cameras,
         timing=camera_timing,
         exposures=camera_settings("exposure", 0.0),
         dt=scene_setting("dt"),

@@ -40,7 +40,7 @@ rule ground_truth:
         mem_mb=truth_memory,
     params:
         bodies=body_settings("shape", "size", "height", "center", "velocity", "spin", "density", "law"),
-        simulation=truth_simulation,
+        simulation=lambda wildcards: simulator(truth_settings(wildcards).dt, truth_settings(wildcards).grid),
         dt=time_step,
         frames=frame_steps,
         particles=lambda wildcards: truth_settings(wildcards).particles,

@@ -1,4 +1,4 @@
-"""How well a law predicts the motion, in numbers and to look at. Only here (and in w/ P.S.) is the truth read."""
+"""Errors and videos of predicted motions. Only these rules (and the row w/ P.S.) read the truth."""
 
 
 rule initial_state:
@@ -56,7 +56,7 @@ rule evaluate:
         simulation=simulation_settings,
         densities=of_bodies(lambda bodies: [case.density(case.moved) for case in bodies]),
         total=of_bodies(carries_total),
-        carrier=evaluated_carrier,
+        particle_source=evaluated_particle_source,
         frames=frame_steps,
         device=SETTINGS.device,
         code=code_of("evaluate.py"),
@@ -84,10 +84,10 @@ rule predict:
         simulation=simulation_settings,
         densities=of_case(lambda case: [case.density(case.moved)]),
         total=of_bodies(carries_total),
-        carrier=of_bodies(shared_carrier),
+        particle_source=of_bodies(shared_particle_source),
         frames=None,
         cameras=scene_cameras,
-        scale=scene_scale,
+        scale=of_section(lambda scene: scene.captured.scale),
         exposure=exposure,
         device=SETTINGS.device,
         code=code_of("predict.py"),
@@ -109,7 +109,7 @@ rule video:
     params:
         density=scene_setting("density"),
         method=of_case(body_parameter),
-        carrier=of_bodies(carrier),
+        particle_source=of_bodies(particle_source),
         gaussian_motion=gaussian_motion,
         view=SETTINGS.evaluation.video_view,
         frame_rate=SETTINGS.evaluation.frame_rate,

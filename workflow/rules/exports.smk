@@ -17,7 +17,7 @@ rule export_gaussians:
         scene=SCENE_OR_EXPERIMENT,
         layout="gaussians|compressed",
     params:
-        carrier=of_bodies(shared_carrier),
+        particle_source=of_bodies(shared_particle_source),
         gaussian_motion=gaussian_motion,
         rotate_harmonics=SETTINGS.exports.rotate_harmonics,
         compressed=lambda wildcards: wildcards.layout == "compressed",
@@ -35,8 +35,8 @@ rule export_particles:
     wildcard_constraints:
         scene=SCENE_OR_EXPERIMENT,
     params:
-        densities=body_densities,
-        carrier=of_bodies(shared_carrier),
+        densities=densities_of(SETTINGS.body_scenes),
+        particle_source=of_bodies(shared_particle_source),
     script:
         "../scripts/export_particles.py"
 
@@ -51,7 +51,7 @@ rule export_surface:
         scene=SCENE_OR_EXPERIMENT,
         kind="glb|usda|usdc",
     params:
-        carrier=of_bodies(shared_carrier),
+        particle_source=of_bodies(shared_particle_source),
     script:
         "../scripts/export_surface.py"
 
@@ -66,7 +66,7 @@ rule export_blend:
     wildcard_constraints:
         scene=SCENE_OR_EXPERIMENT,
     params:
-        carrier=of_bodies(shared_carrier),
+        particle_source=of_bodies(shared_particle_source),
     script:
         "../scripts/export_blend.py"
 
@@ -81,7 +81,7 @@ rule export_film:
     wildcard_constraints:
         scene=SCENE_OR_EXPERIMENT,
     params:
-        carrier=of_bodies(shared_carrier),
+        particle_source=of_bodies(shared_particle_source),
         gaussian_motion=gaussian_motion,
         size=SETTINGS.exports.size,
         frame_rate=SETTINGS.evaluation.frame_rate,

@@ -6,7 +6,7 @@ DRAWN = SETTINGS.figures
 COMPARED = SETTINGS.tables["table1"] if "table1" in SETTINGS.tables else None
 # A law that is evaluated twice is drawn once, on the particles that all methods share, unless figures.beside names it.
 SHARED = [m for m in (COMPARED or SETTINGS).methods if cases.fit_name(SETTINGS, m) == m]
-METHODS = SHARED + [m for m in DRAWN.beside if m not in SHARED]
+METHODS = SHARED + [m for m in SETTINGS.figures.beside if m not in SHARED]
 NAMES = table_titles("table1") if COMPARED else {}
 TITLES = {method: NAMES.get(method) or cases.title(SETTINGS, method) for method in METHODS}
 PREDICTED = ["nclaw", *DRAWN.methods]
@@ -34,20 +34,12 @@ def of_cells(table, name):
     return [f"{RESULTS}/{scene}/{method}/{name}" for method in methods for scene in scenes_of(table)]
 
 
-def of_experiments(name):
-    return [f"{RESULTS}/experiments/{experiment}/{name}" for experiment in SHOWN_EXPERIMENTS]
-
-
 def scenes_of(table):
     return list(SETTINGS.tables[table].scenes) if table in SETTINGS.tables else []
 
 
 def titles_of(table):
     return table_titles(table) if table in SETTINGS.tables else {}
-
-
-def truths_of(scenes):
-    return [f"{DATA}/{scene}/truth.h5" for scene in scenes]
 
 
 def own_bodies(scenes):
@@ -57,7 +49,10 @@ def own_bodies(scenes):
         for scene in scenes:
             case = case_on(scene, method)
             if files := case.method.body_inputs(case):
-                source = body_parameter(case) | {"files": files, "particle_source": case.method.particle_source(case)}
+                source = body_parameter(case) | {
+                    "files": files,
+                    "particle_source": case.method.particle_source(case),
+                }
                 sources.setdefault(method, {})[scene] = source
     return sources
 
@@ -129,7 +124,7 @@ def interpolation(method):
             **filmed(DRAWN.lora_alphav),
             **learned(DRAWN.lora_alphav, method),
             "kernels": kernels("laws", "rendering"),
-            "truth": truths_of(DRAWN.lora_alphav),
+            "truth": [f"{DATA}/{scene}/truth.h5" for scene in DRAWN.lora_alphav],
             "start": [case.method.start_file(case) for case in each],
         },
         "params": {
@@ -150,7 +145,9 @@ def elsewhere(method):
         "kind": "h5",
         "input": {
             "kernels": kernels("rendering"),
-            "rollouts": of_experiments(f"{method}/rollout.h5"),
+            "rollouts": [
+                f"{RESULTS}/experiments/{experiment}/{method}/rollout.h5" for experiment in SHOWN_EXPERIMENTS
+            ],
             **each_of(SHOWN_EXPERIMENTS),
         },
         "params": {
@@ -184,14 +181,10 @@ def of_moved(name):
     return of_splats(lambda scenes: of_methods(scenes, laws, name))
 
 
-def filmed_captures():
-    """Captures of the figure of filmed objects."""
-    return list(DRAWN.realworld or SETTINGS.captures.released or PLANNED)
-
-
 def of_captures(files):
     """A function of wildcards: files of the captures of the figure."""
-    return checked(lambda wildcards: files([training_scene(name) for name in filmed_captures()]))
+    captures = list(DRAWN.realworld or SETTINGS.captures.released or PLANNED)
+    return checked(lambda wildcards: files([training_scene(name) for name in captures]))
 
 
 def of_cameras(scenes):
@@ -317,7 +310,7 @@ FIGURES = {
         "kind": "h5",
         "input": {
             "kernels": kernels("rendering"),
-            "display": of_captures(
+            "shown": of_captures(
                 lambda scenes: [f"{DATA}/{scene}/shown/transforms.json" for scene in scenes]
             ),
             "rollouts": of_captures(lambda scenes: of_methods(scenes, DRAWN.realworld_methods, "rollout.h5")),

@@ -14,11 +14,11 @@ rule identify:
         gpu=GPU,
     params:
         simulation=simulation_settings,
-        densities=video_densities,
+        densities=densities_of(SETTINGS.video_scenes),
         binding=SETTINGS.binding.plain(),
         identify=identify_settings,
         seed=seed_of("particles"),
-        stock=published_law,
+        published=published_law,
         exposure=exposure,
         device=SETTINGS.device,
     script:
@@ -37,7 +37,7 @@ rule identified_page:
     output:
         page=f"{RESULTS}/{{scene}}/identified.png",
     params:
-        law=known_law,
+        law=of_section(lambda scene: scene.plain()["law"]),
     script:
         "../scripts/identified_page.py"
 

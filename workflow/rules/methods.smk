@@ -138,24 +138,24 @@ def carries_total(bodies):
     return any(case.options.covariance_from == "total" for case in bodies)
 
 
-def carrier(bodies):
+def particle_source(bodies):
     return bodies[0].method.particle_source(bodies[0])
 
 
-def shared_carrier(bodies):
+def shared_particle_source(bodies):
     """The same where there are no particles of a fit: experiments, splats and captures."""
     case = bodies[0]
     if case.method.body_inputs(case):
         raise InputError(
             f"{case.moved}/{case.name}",
-            "it is evaluated on particles of its own fit, which only scenes with rendered videos have",
+            "it is evaluated on the particles of its fit, which only scenes with rendered videos have",
             f"Choose {case.name}, which has the same fit and is evaluated on the particles that all methods share",
         )
-    return carrier(bodies)
+    return particle_source(bodies)
 
 
-def evaluated_carrier(wildcards):
-    return of_bodies(shared_carrier if of_experiment(wildcards) else carrier)(wildcards)
+def evaluated_particle_source(wildcards):
+    return of_bodies(shared_particle_source if of_experiment(wildcards) else particle_source)(wildcards)
 
 
 @checked
@@ -188,11 +188,11 @@ def published_law(wildcards):
 @checked
 def identify_settings(wildcards):
     """Settings of an identification, in the views that its file names, if any."""
-    finer, own = SETTINGS.identify.refined_particles, SETTINGS.geometry.particles
-    if 0 < finer <= own:
+    refined, own = SETTINGS.identify.refined_particles, SETTINGS.geometry.particles
+    if 0 < refined <= own:
         raise InputError(
             "identify.refined_particles",
-            f"{finer} must exceed geometry.particles = {own}",
+            f"{refined} must exceed geometry.particles = {own}",
             f"Set it to {4 * own}, or to 0 to disable the discretisation correction",
         )
     views = getattr(wildcards, "views", None)

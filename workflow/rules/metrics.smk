@@ -23,7 +23,7 @@ rule image_metrics:
     params:
         density=scene_setting("density"),
         method=of_case(body_parameter),
-        carrier=of_bodies(carrier),
+        particle_source=of_bodies(particle_source),
         gaussian_motion=gaussian_motion,
         views=of_case(evaluation_views),
         training_views=of_case(lambda case: list(case.options.views)),

@@ -1,14 +1,9 @@
-"""Inputs of predictions of splats and of exported motions. Needs methods.smk."""
-
-
-def splat_setting(choose):
-    """A function of wildcards: something of the settings of their scene's splat."""
-    return checked(lambda wildcards: choose(SETTINGS.scene(wildcards.scene)))
+"""Inputs of predictions of splats. Needs methods.smk."""
 
 
 @checked
 def splat_start(wildcards):
-    """The start of a splat; its law comes from elsewhere, as it has no video to learn one from."""
+    """File of the initial motion of a splat. Its law is that of another scene, as it has no video."""
     scene, method = wildcards.scene, wildcards.method
     case = case_on(scene, method)
     case.method.model_options(case)  # refuses a true law, which a splat does not have
@@ -21,20 +16,6 @@ def splat_start(wildcards):
     return of_replicate("velocity.json")(wildcards)
 
 
-@checked
-def splat_simulation(wildcards):
-    dt, _ = cases.motion_clock(SETTINGS, wildcards.scene, wildcards.method)
-    return simulator(dt)
-
-
-@checked
-def splat_frames(wildcards):
-    _, frames = cases.motion_clock(SETTINGS, wildcards.scene, wildcards.method)
-    return list(frames)
-
-
-@checked
-def body_densities(wildcards):
-    """Densities of the bodies of a scene or an experiment."""
-    scenes = SETTINGS.body_scenes(subject(wildcards))
-    return [SETTINGS.scene(scene).plain()["density"] for scene in scenes]
+def splat_clock(choose):
+    """A function of wildcards: something of the time step [s] and the frames of a splat's motion."""
+    return checked(lambda wildcards: choose(*cases.motion_clock(SETTINGS, wildcards.scene, wildcards.method)))

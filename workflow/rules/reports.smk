@@ -49,12 +49,7 @@ def prior_rollout(wildcards):
     return f"{take_run(captured.capture, captured.throw, PRIOR)}/rollout.h5"
 
 
-def scene_scale(wildcards):
-    return SETTINGS.scene(wildcards.scene).captured.scale
-
-
-def scene_cameras(wildcards):
-    return list(SETTINGS.scene(wildcards.scene).captured.cameras)
+scene_cameras = of_section(lambda scene: list(scene.captured.cameras))
 
 
 @checked

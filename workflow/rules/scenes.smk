@@ -12,11 +12,6 @@ def result_path(name, file):
     return paths.result_path(SETTINGS, name, file)
 
 
-def scene_prior(scene):
-    """The file of the prior of a scene in its replicate."""
-    return paths.prior_file(SETTINGS, scene, SETTINGS.scene(scene).prior)
-
-
 def of_replicate(file):
     """A function of wildcards: a file of the scene or experiment in its replicate."""
     return checked(lambda wildcards: result_path(subject(wildcards), file))
@@ -82,6 +77,11 @@ def each_of(bodies):
     return {name: [result_path(body, file) for body in bodies] for name, file in BODY.items()}
 
 
+def of_section(choose):
+    """A function of wildcards: something of the settings of their scene."""
+    return checked(lambda wildcards: choose(SETTINGS.scene(wildcards.scene)))
+
+
 def scene_setting(*names):
     """A function of wildcards: the named settings of the scene, as plain values."""
 
@@ -94,11 +94,6 @@ def scene_setting(*names):
         return scene[names[0]] if len(names) == 1 else {name: scene[name] for name in names}
 
     return choose
-
-
-def known_law(wildcards):
-    """The true law of a scene; None of one without a truth."""
-    return SETTINGS.scene(wildcards.scene).plain()["law"]
 
 
 def origin_of(part, scene):
@@ -181,16 +176,14 @@ def simulator(dt, grid=None):
     return {"dt": dt, **{name: section[name] for name in ("grid", "gravity", "boundary", "walls")}}
 
 
-def truth_simulation(wildcards):
-    """Constants of the simulator for the ground truth of a scene or experiment."""
-    truth = truth_settings(wildcards)
-    return simulator(truth.dt, truth.grid)
+def densities_of(scenes):
+    """A function of wildcards: densities of the bodies of all scenes that belong to a scene or an experiment."""
 
+    @checked
+    def choose(wildcards):
+        return [SETTINGS.scene(scene).plain()["density"] for scene in scenes(subject(wildcards))]
 
-@checked
-def video_densities(wildcards):
-    """Densities of the bodies of all videos of a scene."""
-    return [SETTINGS.scene(scene).plain()["density"] for scene in SETTINGS.video_scenes(wildcards.scene)]
+    return choose
 
 
 def body_settings(*keys):

@@ -39,8 +39,8 @@ GPU = int({"cpu": False, "cuda": True, "auto": HAS_CUDA}[SETTINGS.device])
 EITHER_DEVICE = "cpu" if SETTINGS.device == "cpu" else "auto"
 EITHER_GPU = int(GPU and HAS_CUDA)
 
-# Scripts are processes of their own: they find the library, share one kernel cache, and keep to one thread each
-# (two OpenMP threads on a busy machine are far slower than one). NEUMA_GPUS spreads them over so many GPUs.
+# Scripts run in separate processes. They find the library, share one kernel cache, and use one thread each (two OpenMP
+# threads on a busy machine are far slower than one). NEUMA_GPUS is the number of GPUs to spread them over.
 THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 SPREAD = [str(ROOT / "workflow" / "gpus")] if os.environ.get("NEUMA_GPUS") else []
 os.environ.update(
@@ -84,7 +84,7 @@ SPLAT_SCENE = scenes_that(lambda scene: scene.splat)
 OBJECT_SCENE = scenes_that(lambda scene: not (scene.captured and scene.captured.throw))
 PICTURED_SCENE = scenes_that(lambda scene: not scene.splat and not (scene.captured and scene.captured.throw))
 TAKE_SCENE = scenes_that(lambda scene: scene.captured and scene.captured.throw, replicates=False)
-# Experiments are folders of their own, and rules that also accept scenes have the wildcard `scene` for both.
+# Experiments have their own folder. Rules that also accept scenes have the wildcard `scene` for both.
 EXPERIMENT = f"experiments/{names_of(SETTINGS.experiments)}"
 
 

@@ -3,14 +3,14 @@
 
 rule splat_gaussians:
     input:
-        splat=splat_setting(lambda scene: scene.splat.file),
+        splat=of_section(lambda scene: scene.splat.file),
     output:
         gaussians=f"{RESULTS}/{{scene}}/gaussians.ply",
         report=f"{RESULTS}/{{scene}}/gaussians.json",
     wildcard_constraints:
         scene=SPLAT_SCENE,
     params:
-        splat=splat_setting(lambda scene: scene.splat.plain()),
+        splat=of_section(lambda scene: scene.splat.plain()),
         place=scene_setting("size", "height", "center"),
         seed=seed_of("gaussians"),
     script:
@@ -26,9 +26,9 @@ rule splat_mesh:
     wildcard_constraints:
         scene=SPLAT_SCENE,
     params:
-        views=splat_setting(lambda scene: scene.splat.views),
-        pixels=splat_setting(lambda scene: scene.splat.pixels),
-        edge=splat_setting(lambda scene: scene.splat.edge),
+        views=of_section(lambda scene: scene.splat.views),
+        pixels=of_section(lambda scene: scene.splat.pixels),
+        edge=of_section(lambda scene: scene.splat.edge),
         surface=SETTINGS.geometry.surface.plain(),
     script:
         "../scripts/splat_mesh.py"
@@ -58,11 +58,11 @@ use rule predict as predict_splat with:
         scene=SPLAT_SCENE,
     params:
         method=of_bodies(model_parameter),
-        simulation=splat_simulation,
+        simulation=splat_clock(lambda dt, frames: simulator(dt)),
         densities=of_case(lambda case: [SETTINGS.scene(case.moved).plain()["density"]]),
         total=of_bodies(carries_total),
-        carrier=of_bodies(shared_carrier),
-        frames=splat_frames,
+        particle_source=of_bodies(shared_particle_source),
+        frames=splat_clock(lambda dt, frames: list(frames)),
         cameras=None,
         scale=None,
         exposure=None,

@@ -1,6 +1,6 @@
-"""What tables are made of: runs and files of their cells, titles. Needs methods.smk."""
+"""Inputs of tables: runs and files of their cells, titles. Needs methods.smk."""
 
-# Tables of distances; the others have rules of their own.
+# Tables of distances. The others have their own rules.
 OTHER_TABLES = ("table4", "stress")
 CHAMFER_TABLES = [name for name in SETTINGS.tables if name not in OTHER_TABLES]
 

@@ -6,7 +6,11 @@ rule velocity:
         **body_files(),
         kernels=kernels("laws", "rendering"),
         transforms=of_data("dynamic/transforms.json"),
-        prior=lambda wildcards: scene_prior(wildcards.scene),
+        prior=checked(
+            lambda wildcards: paths.prior_file(
+                SETTINGS, wildcards.scene, SETTINGS.scene(wildcards.scene).prior
+            )
+        ),
     output:
         velocity=f"{RESULTS}/{{scene}}/velocity.json",
     wildcard_constraints:

@@ -64,21 +64,23 @@ def main(inputs, output, params, run) -> None:
     device = choose_device(params.device)
     weights, _ = read_weights(inputs.weights)
     networks = {name: LPIPS(weights, name).to(device) for name in ("vgg", "alex")}
-    needed = filmed_steps(inputs.shown, [params.view], **params.exposure)
+    needed = filmed_steps(inputs.display, [params.view], **params.exposure)
     predictions = []
     for rollout, motion in [(inputs.rollout, params.gaussian_motion), (inputs.prior, params.prior_motion)]:
         if rollout:
-            carrier = params.carrier if rollout == inputs.rollout else "binding"
+            particle_source = params.particle_source if rollout == inputs.rollout else "binding"
             files = (inputs.particles, inputs.binding, inputs.gaussians)
-            body = load_reconstruction(*files, params.density, carrier, motion).to(torch.float32, device)
+            body = load_reconstruction(*files, params.density, particle_source, motion).to(
+                torch.float32, device
+            )
             predictions.append(Prediction(body, rollout, needed))
-    folder = Path(inputs.shown).parent
-    entries = {f["step"]: f for f in read_transforms(inputs.shown)["frames"] if f["view"] == params.view}
+    folder = Path(inputs.display).parent
+    entries = {f["step"]: f for f in read_transforms(inputs.display)["frames"] if f["view"] == params.view}
     background = read_picture(folder / next(iter(entries.values()))["plate"])
     steps = sorted(entries)
     measured = {steps[k] for k in spread_frames(len(steps), params.measured)}
     measures, panels = [], []
-    for video in load_videos(inputs.shown, [params.view], **params.exposure):
+    for video in load_videos(inputs.display, [params.view], **params.exposure):
         video = video.to(torch.float32, device)
         with torch.no_grad():
             renders = zip(*(prediction.frames(video) for prediction in predictions), strict=True)

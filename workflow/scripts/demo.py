@@ -15,7 +15,7 @@ PAGE = """\
 {rows}
 
 - film: {film}
-- law: {law}, by `neuma_lib.io.laws.load_law` or as the `prior` of a scene ([what it says]({page}))
+- law: {law}, by `neuma_lib.io.laws.load_law` or as the `prior` of a scene ([its curves]({page}))
 {viewer}"""
 
 
@@ -31,7 +31,7 @@ def main(inputs, output, params, run) -> None:
         f"{title} {error:.1f} mm" for title, error in zip(params.titles, errors, strict=True)
     )
     run.log(
-        f"error of the motion: {errors_text}. Look at {', '.join([inputs.film, *viewer])}; all of it: {output.page}"
+        f"error of the motion: {errors_text}. Open {', '.join([inputs.film, *viewer])}. All files: {output.page}"
     )
 
 

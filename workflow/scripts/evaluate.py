@@ -18,7 +18,7 @@ def main(inputs, output, params, run) -> None:
     truth, _ = read_arrays(inputs.truth, only=names, required=names)
     measure, _ = read_arrays(inputs.tracers, required=("starts", "floor"))
     prediction = Prediction(inputs, params.method)
-    start, counts = prediction.start(params.densities, params.carrier)
+    start, counts = prediction.start(params.densities, params.particle_source)
     model = prediction.model(dt, counts)
     evaluation = evaluate(
         MPM(**params.simulation),

@@ -14,7 +14,7 @@ SQUARE = 2
 
 def main(inputs, output, params, run) -> None:
     files = (inputs.particles, inputs.binding, inputs.gaussians)
-    body = load_reconstruction(*files, 1.0, params.carrier, params.gaussian_motion)
+    body = load_reconstruction(*files, 1.0, params.particle_source, params.gaussian_motion)
     x, F = load_motion(inputs.rollout)
     seen = seen_around(body, x, F)
     wide, high = np.ptp(seen, axis=0)[:2]

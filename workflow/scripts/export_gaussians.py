@@ -14,7 +14,7 @@ from workflow.stage import run_script
 
 def main(inputs, output, params, run) -> None:
     files = (inputs.particles, inputs.binding, inputs.gaussians)
-    body = load_reconstruction(*files, 1.0, params.carrier, params.gaussian_motion)
+    body = load_reconstruction(*files, 1.0, params.particle_source, params.gaussian_motion)
     x, F = load_motion(inputs.rollout)
     order = morton_order(body.gaussians.means.double().numpy())  # of all frames: a Gaussian keeps its place
     for k in range(len(x)):

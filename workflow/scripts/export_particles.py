@@ -12,7 +12,7 @@ from workflow.stage import run_script
 
 def main(inputs, output, params, run) -> None:
     files = (inputs.particles, inputs.binding, inputs.gaussians, inputs.velocity)
-    start, _ = load_initial_state(*files, params.densities, params.carrier)
+    start, _ = load_initial_state(*files, params.densities, params.particle_source)
     names = ("x", "F", "frames")
     path, attributes = read_arrays(inputs.rollout, required=names, only=names)
     for k, (x, F) in enumerate(zip(path["x"], path["F"], strict=True)):

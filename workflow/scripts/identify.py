@@ -39,7 +39,7 @@ def main(inputs, output, params, run) -> None:
         params.seed + 1, params.seed + 1 + (settings.resamplings if settings.refined_particles else 0)
     )
     meshes = [read_mesh(file) for file in listed(inputs.mesh)]
-    finer = [
+    refined = [
         [
             body.resampled(
                 torch.from_numpy(sample_volume(mesh, settings.refined_particles, seed)),
@@ -55,8 +55,8 @@ def main(inputs, output, params, run) -> None:
         MPM(**params.simulation),
         *videos[0],
         settings,
-        params.stock,
-        refined=finer,
+        params.published,
+        refined=refined,
         other_videos=videos[1:],
         progress=run.progress,
         log=run.log,

@@ -40,7 +40,7 @@ def main(inputs, output, params, run) -> None:
     weights, _ = read_weights(inputs.weights)
     networks = {name: LPIPS(weights, name).to(device) for name in ("vgg", "alex")}
     prediction = Prediction(inputs, params.method)
-    body = prediction.body(params.density, params.carrier, params.gaussian_motion, device)
+    body = prediction.body(params.density, params.particle_source, params.gaussian_motion, device)
     arrays, _ = read_arrays(inputs.rollout, required=("frames",), only=("frames",))
     x, F = (state.to(device) for state in load_motion(inputs.rollout))
     steps, by_step = arrays["frames"].tolist(), {}

@@ -1,4 +1,4 @@
-"""Judge what training starts from against the truth: static fit, mesh, particles, velocity."""
+"""Evaluate what training starts from against the truth: static fit, mesh, particles, velocity."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from neuma_lib.io.mesh import read_mesh
 from neuma_lib.io.particles import load_particles
 from workflow.stage import run_script
 
-LEAST_SPIN = 1.0
+MIN_SPIN = 1.0
 """Errors of slower spins are given in percent of this [rad/s]: in the tenth of a second before contact it turns a body
 by 6 degrees."""
 
@@ -30,7 +30,7 @@ def main(inputs, output, params, run) -> None:
     v0 = np.asarray(scene["velocity"]) + np.cross(spin, np.asarray(velocity["centre"]) - centre)
     in_camera, free = (axes @ (np.asarray(fit["v0"]) - v0) for fit in (velocity, velocity["without_ridge"]))
     turning = axes @ (np.asarray(velocity["angular_velocity"]) - spin)
-    speed, rate = float(np.linalg.norm(v0)), max(float(np.linalg.norm(spin)), LEAST_SPIN)
+    speed, rate = float(np.linalg.norm(v0)), max(float(np.linalg.norm(spin)), MIN_SPIN)
     added = int(attributes["added"])
     report = {
         "gaussians": fit["count"],

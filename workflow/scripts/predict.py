@@ -18,7 +18,7 @@ from workflow.stage import run_script
 def main(inputs, output, params, run) -> None:
     device, dt = choose_device(params.device), params.simulation["dt"]
     prediction = Prediction(inputs, params.method)
-    start, counts = prediction.start(params.densities, params.carrier)
+    start, counts = prediction.start(params.densities, params.particle_source)
     start, model, mpm = start.to(device), prediction.model(dt, counts), MPM(**params.simulation)
     frames = params.frames
     if params.cameras:

@@ -21,7 +21,7 @@ from workflow.stage import run_script
 def main(inputs, output, params, run) -> None:
     device = choose_device(params.device)
     prediction = Prediction(inputs, params.method)
-    body = prediction.body(params.density, params.carrier, params.gaussian_motion, device)
+    body = prediction.body(params.density, params.particle_source, params.gaussian_motion, device)
     x, F = load_motion(inputs.rollout)
     steps = read_arrays(inputs.rollout, required=("frames",), only=("frames",))[0]["frames"].tolist()
     panels, quality = {}, []

@@ -24,22 +24,17 @@ from neuma_lib.io.files import atomic
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-MARGIN = 0.010
-"""Unprintable border of the page [m]."""
-FOOT = 0.024
-"""Strip under the squares for the ruler and the text [m]."""
-RULER = 0.100
-"""Length of the printed ruler [m]."""
-MIN_CORNERS = 6
-"""Corners required for a pose."""
+_MARGIN = 0.010  # unprintable border of the page [m]
+_FOOT = 0.024  # strip under the squares for the ruler and the text [m]
+_RULER = 0.100  # length of the printed ruler [m]
+_MIN_CORNERS = 6  # corners required for a pose
 NEIGHBOURS = 13
 """Number of nearest corners, including itself, used to predict the position of a corner."""
 NEIGHBOUR_TOLERANCE = (0.4, 0.005)
 """Tolerated distance of a corner from its prediction: pixels, and share of a square's side."""
 MIN_ANGLE = np.deg2rad(3.0)
 """Angle between rays required to triangulate a corner. Smaller angles determine its distance poorly."""
-MAX_PIXELS = 2.0
-"""Tolerated root-mean-square reprojection error of a pose [px]."""
+_MAX_PIXELS = 2.0  # tolerated root-mean-square reprojection error of a pose [px]
 MAX_MISFIT = 0.05
 """Tolerated root-mean-square misfit of the board's corners [squares]. A bent or moved print exceeds it."""
 Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
@@ -146,7 +141,7 @@ def board_page(board: BoardConfig, paper: str) -> Figure:
         raise InputError("paper", f"unknown size {paper!r}", f"Use one of {', '.join(PAPERS)}")
     width, height = PAPERS[paper]
     columns, rows = board.squares
-    room = min((width - 2 * MARGIN) / columns, (height - 2 * MARGIN - FOOT) / rows)
+    room = min((width - 2 * _MARGIN) / columns, (height - 2 * _MARGIN - _FOOT) / rows)
     if board.square > room:
         raise InputError(
             "board.square",
@@ -160,25 +155,25 @@ def board_page(board: BoardConfig, paper: str) -> Figure:
     axes.set(xlim=(0, 1000 * width), ylim=(0, 1000 * height))
     axes.axis("off")
     left = (width - columns * board.square) / 2
-    bottom = MARGIN + FOOT + (height - 2 * MARGIN - FOOT - rows * board.square) / 2
+    bottom = _MARGIN + _FOOT + (height - 2 * _MARGIN - _FOOT - rows * board.square) / 2
     black, white = black_rectangles(board)
     for rectangles, colour in ((black, "black"), (white, "white")):
         for x, y, w, h in 1000 * (rectangles + [left, bottom, 0, 0]):
             axes.add_patch(Rectangle((x, y), w, h, facecolor=colour, linewidth=0))
-    start, line = 1000 * MARGIN, 1000 * (MARGIN + 0.010)
-    axes.add_patch(Rectangle((start, line), 1000 * RULER, 0.3, facecolor="black", linewidth=0))
-    for millimetre in range(0, round(1000 * RULER) + 1, 5):
+    start, line = 1000 * _MARGIN, 1000 * (_MARGIN + 0.010)
+    axes.add_patch(Rectangle((start, line), 1000 * _RULER, 0.3, facecolor="black", linewidth=0))
+    for millimetre in range(0, round(1000 * _RULER) + 1, 5):
         tall = 4.0 if millimetre % 50 == 0 else 2.5 if millimetre % 10 == 0 else 1.5
         axes.add_patch(Rectangle((start + millimetre - 0.1, line), 0.2, tall, facecolor="black", linewidth=0))
     axes.text(start, line + 5, "0", fontsize=7, ha="center")
-    axes.text(start + 1000 * RULER, line + 5, f"{1000 * RULER:.0f} mm", fontsize=7, ha="center")
+    axes.text(start + 1000 * _RULER, line + 5, f"{1000 * _RULER:.0f} mm", fontsize=7, ha="center")
     words = (
         f"ChArUco {columns} x {rows}, {board.dictionary}, marker {board.marker:g} of a square. Square: "
-        f"{1000 * board.square:.2f} mm if this ruler is {1000 * RULER:.0f} mm long.\n"
+        f"{1000 * board.square:.2f} mm if this ruler is {1000 * _RULER:.0f} mm long.\n"
         "Print at 100 %, without 'fit to page'. Measure the ruler and the board's width on the print, and give the "
         "true side of a square as board.square [m]."
     )
-    axes.text(start, 1000 * MARGIN, words, fontsize=6, va="bottom", linespacing=1.3)
+    axes.text(start, 1000 * _MARGIN, words, fontsize=6, va="bottom", linespacing=1.3)
     return figure
 
 
@@ -216,7 +211,7 @@ def _refined(grey: np.ndarray, ids: np.ndarray, corners: np.ndarray, board: Boar
             start = corner.reshape(1, 1, 2).astype(np.float32)
             refined[i] = cv2.cornerSubPix(grey, start, (window, window), (-1, -1), (3, 50, 1e-3)).ravel()
     kept = []
-    for i in range(len(ids) if len(ids) >= MIN_CORNERS else 0):
+    for i in range(len(ids) if len(ids) >= _MIN_CORNERS else 0):
         others = np.argsort(distances[i], kind="stable")[1:NEIGHBOURS]
         homography, _ = cv2.findHomography(places[others].astype(np.float32), refined[others], cv2.LMEDS)
         if homography is None:
@@ -243,10 +238,10 @@ def board_pose(detection: Detection, board: BoardConfig, lens: Lens, where: str)
     """
     cv2 = opencv()
     points = corner_positions(board)[detection.ids]
-    if len(points) < MIN_CORNERS or np.linalg.matrix_rank(points - points.mean(axis=0), 1e-9) < 2:
+    if len(points) < _MIN_CORNERS or np.linalg.matrix_rank(points - points.mean(axis=0), 1e-9) < 2:
         raise InputError(
             where,
-            f"{len(points)} corners of the board are detected, {MIN_CORNERS} in two rows are required",
+            f"{len(points)} corners of the board are detected, {_MIN_CORNERS} in two rows are required",
             "Check that the board is the one of capture.yaml, in focus and without glare",
         )
     seen = lens.directions(detection.pixels)
@@ -261,8 +256,8 @@ def board_pose(detection: Detection, board: BoardConfig, lens: Lens, where: str)
         from_above = (pose[:3, :3].T @ pose[:3, 3])[2] < 0
         if from_above and (best is None or error < best[1]):
             best = pose, error
-    if best is None or not best[1] < MAX_PIXELS:
-        error = f" (error {best[1]:.1f} px, limit {MAX_PIXELS:g} px)" if best else ""
+    if best is None or not best[1] < _MAX_PIXELS:
+        error = f" (error {best[1]:.1f} px, limit {_MAX_PIXELS:g} px)" if best else ""
         raise InputError(
             where,
             f"the corners do not fit a flat board seen from above{error}",
@@ -307,11 +302,11 @@ def fit_board(
             numbers.append(number)
             points.append(point)
     printed = corner_positions(board)[numbers] if numbers else np.empty((0, 3))
-    if len(numbers) < MIN_CORNERS or np.linalg.matrix_rank(printed - printed.mean(axis=0), 1e-9) < 2:
+    if len(numbers) < _MIN_CORNERS or np.linalg.matrix_rank(printed - printed.mean(axis=0), 1e-9) < 2:
         raise InputError(
             "board",
             f"it is visible in {pictures} of {len(detections)} pictures, and {len(numbers)} of its corners from two"
-            f" sides, {MIN_CORNERS} in two rows are required",
+            f" sides, {_MIN_CORNERS} in two rows are required",
             "Photograph the uncovered board with the object from all sides, or set `length` instead",
         )
     world = np.stack(points)

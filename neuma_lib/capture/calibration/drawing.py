@@ -18,12 +18,9 @@ from neuma_lib.fitting.frame_batches import spread_frames
 from neuma_lib.io.images import OPENGL_TO_OPENCV, read_transforms
 from neuma_lib.project.capture_folder import PHOTOGRAPHS
 
-GRID = 0.1
-"""Spacing of the floor lines [m of the room]."""
-QUANTILES = (0.02, 0.98)
-"""Quantiles of the points that limit a plot of cameras and points."""
-MAX_PHOTOGRAPHS = 8
-"""Photographs into which the floor is drawn."""
+_GRID = 0.1  # spacing of the floor lines [m of the room]
+_QUANTILES = (0.02, 0.98)  # quantiles of the points that limit a plot of cameras and points
+_MAX_PHOTOGRAPHS = 8  # photographs into which the floor is drawn
 
 
 def draw_room(path: str | Path, room: Room) -> None:
@@ -50,7 +47,7 @@ def draw_cameras(path: str | Path, poses: Poses, unit: str, suffix: str = "", fl
     near = (np.abs(poses.points) < reach).all(axis=1)
     extent = centres
     if near.any():
-        extent = np.concatenate([centres, np.quantile(poses.points[near], QUANTILES, axis=0)])
+        extent = np.concatenate([centres, np.quantile(poses.points[near], _QUANTILES, axis=0)])
     low, high = extent.min(axis=0) - 0.1 * reach, extent.max(axis=0) + 0.1 * reach
     figure = new_figure(12, 6)
     groups = ((~fixed, "tab:blue", "photographs"), (fixed, "tab:red", "fixed cameras"))
@@ -86,17 +83,17 @@ def draw_floor(path: str | Path, transforms: str | Path) -> None:
     scale = data.get("world", {}).get("scale", 1.0)
     photographs = [frame for frame in data["frames"] if frame["group"] == PHOTOGRAPHS]
     frames = [frame for frame in data["frames"] if frame["group"] != PHOTOGRAPHS]
-    frames += [photographs[i] for i in spread_frames(len(photographs), MAX_PHOTOGRAPHS)]
+    frames += [photographs[i] for i in spread_frames(len(photographs), _MAX_PHOTOGRAPHS)]
     pictures = []
     for frame in frames:
         picture = Image.fromarray(read_picture(Path(transforms).parent / frame["file_path"]))
         viewmat = np.linalg.inv(np.array(frame["transform_matrix"]) @ OPENGL_TO_OPENCV)
         draw = ImageDraw.Draw(picture)
         wide = max(1, picture.width // 400)
-        for ends, colour, lines in _box_lines(GRID * scale):
+        for ends, colour, lines in _box_lines(_GRID * scale):
             _draw_line(draw, ends, viewmat, frame, colour, lines * wide)
         pictures.append((frame["file_path"], np.asarray(picture)))
-    title = f"floor lines every {GRID:g} m, x red, y (up) green, z blue, the box is {1 / scale:g} m wide"
+    title = f"floor lines every {_GRID:g} m, x red, y (up) green, z blue, the box is {1 / scale:g} m wide"
     picture_sheet(path, pictures, title, columns=3)
 
 

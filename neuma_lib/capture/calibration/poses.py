@@ -24,14 +24,11 @@ from neuma_lib.io.images import OPENGL_TO_OPENCV, read_transforms
 from neuma_lib.io.ply import read_ply, write_ply
 from neuma_lib.project.capture_folder import PHOTOGRAPHS
 
-MIN_PHOTOGRAPHS = 8
-"""Photographs required for structure from motion."""
+_MIN_PHOTOGRAPHS = 8  # photographs required for structure from motion
 FEW_PHOTOGRAPHS = 20
 """Number below which thresholds are lower (`_mapping_options`) and the lens is not refined (`_refine_lens`)."""
-MIN_REGISTERED = 0.7
-"""Share of the photographs that must be registered."""
-LARGEST = 2400
-"""Longer side of pictures for feature extraction [px]."""
+_MIN_REGISTERED = 0.7  # share of the photographs that must be registered
+_LARGEST = 2400  # longer side of pictures for feature extraction [px]
 PHOTOGRAPH_MODEL, STILL_MODEL = "RADIAL", "SIMPLE_RADIAL"
 """COLMAP's camera models during mapping, with square pixels and a centred lens: with ten photographs, a second focal
 length is off by up to 4 %."""
@@ -39,8 +36,7 @@ REFINED_MODEL = "OPENCV"
 """Final model of the photographs, with a free principal point, if there are enough of them."""
 MAX_OFF_CENTRE = 0.02
 """Distance of a phone's principal point from the centre, as share of the longer side. A larger one is undetermined."""
-MAX_STRETCH = 0.01
-"""Relative difference between the focal lengths of the two sides."""
+_MAX_STRETCH = 0.01  # relative difference between the focal lengths of the two sides
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,10 +185,10 @@ def structure_from_motion(
         InputError: too few photographs, or `check_registered` fails.
     """
     photographs = [name for name in pictures if group_of(name) == PHOTOGRAPHS]
-    if len(photographs) < MIN_PHOTOGRAPHS:
+    if len(photographs) < _MIN_PHOTOGRAPHS:
         raise InputError(
             PHOTOGRAPHS,
-            f"{len(photographs)} are too few, at least {MIN_PHOTOGRAPHS} are required",
+            f"{len(photographs)} are too few, at least {_MIN_PHOTOGRAPHS} are required",
             "Take 30 to 60 photographs all around the object, each overlapping the previous one by two thirds",
         )
     pycolmap = colmap()
@@ -205,7 +201,7 @@ def structure_from_motion(
     database.unlink(missing_ok=True)  # of an earlier run
     shutil.rmtree(models_folder, ignore_errors=True)
     models_folder.mkdir()
-    extraction = pycolmap.FeatureExtractionOptions(max_image_size=LARGEST, num_threads=1, use_gpu=False)
+    extraction = pycolmap.FeatureExtractionOptions(max_image_size=_LARGEST, num_threads=1, use_gpu=False)
     for group in dict.fromkeys(map(group_of, pictures)):
         reader = pycolmap.ImageReaderOptions(
             camera_model=PHOTOGRAPH_MODEL if group == PHOTOGRAPHS else STILL_MODEL
@@ -334,17 +330,17 @@ def plausible(lens: Lens) -> bool:
     """Whether the principal point and the pixel aspect of a lens are in the range of phones."""
     off_centre = np.abs(lens.K[:2, 2] - [lens.width / 2, lens.height / 2]).max()
     stretch = abs(lens.K[0, 0] / lens.K[1, 1] - 1)
-    return bool(off_centre < MAX_OFF_CENTRE * max(lens.width, lens.height) and stretch < MAX_STRETCH)
+    return bool(off_centre < MAX_OFF_CENTRE * max(lens.width, lens.height) and stretch < _MAX_STRETCH)
 
 
 def check_registered(poses: Poses) -> None:
     """Raises InputError unless enough photographs and all fixed cameras are registered."""
     lost = [name for name in poses.lost if group_of(name) == PHOTOGRAPHS]
     placed = sum(group_of(name) == PHOTOGRAPHS for name in poses.names)
-    if placed < MIN_REGISTERED * (placed + len(lost)):
+    if placed < _MIN_REGISTERED * (placed + len(lost)):
         raise InputError(
             PHOTOGRAPHS,
-            f"{placed} of {placed + len(lost)} were registered (not {_some(lost)}), at least {MIN_REGISTERED:.0%} are"
+            f"{placed} of {placed + len(lost)} were registered (not {_some(lost)}), at least {_MIN_REGISTERED:.0%} are"
             " required",
             "Take more photographs, all around and at two heights, in focus, with nothing moved in between",
         )

@@ -11,17 +11,14 @@ import numpy as np
 
 from neuma_lib.capture.tools import opencv
 
-MAX_BACKGROUND_FRAMES = 61
-"""Number of frames in the median."""
-SHADOW = (0.4, 0.97)
-"""Range of the factor by which a shadow darkens."""
-SHADOW_TINT = 0.06
-"""Maximum difference between the factors of the channels in a shadow."""
+_MAX_BACKGROUND_FRAMES = 61  # number of frames in the median
+_SHADOW = (0.4, 0.97)  # range of the factor by which a shadow darkens
+_SHADOW_TINT = 0.06  # maximum difference between the factors of the channels in a shadow
 
 
 def median_background(frames: Sequence[np.ndarray]) -> np.ndarray:
     """Background as the median of frames (H, W, 3), uint8, correct where the object covers fewer than half of them."""
-    chosen = np.linspace(0, len(frames) - 1, min(len(frames), MAX_BACKGROUND_FRAMES)).round().astype(int)
+    chosen = np.linspace(0, len(frames) - 1, min(len(frames), _MAX_BACKGROUND_FRAMES)).round().astype(int)
     return np.median(np.stack([frames[i] for i in chosen]), axis=0).round().astype(np.uint8)
 
 
@@ -67,7 +64,7 @@ def compare(frame: np.ndarray, expected: np.ndarray) -> tuple[np.ndarray, np.nda
     factor = seen / np.maximum(empty, 1.0)
     spread = largest_channel(factor) + largest_channel(-factor)
     mean = (factor[..., 0] + factor[..., 1] + factor[..., 2]) / 3
-    return pictures[0] - expected, (mean > SHADOW[0]) & (mean < SHADOW[1]) & (spread < SHADOW_TINT)
+    return pictures[0] - expected, (mean > _SHADOW[0]) & (mean < _SHADOW[1]) & (spread < _SHADOW_TINT)
 
 
 def largest_channel(picture: np.ndarray) -> np.ndarray:

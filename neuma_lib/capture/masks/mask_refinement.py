@@ -22,10 +22,8 @@ from neuma_lib.capture.masks.regions import box_of, component, grown, in_full, r
 from neuma_lib.capture.masks.silhouettes import UNSEEN, cheapest
 from neuma_lib.capture.tools import opencv
 
-ROUNDS = 2
-"""Iterations of hull, colours and masks."""
-BAND = 2.0
-"""Distance between the edges of object and hull, in voxels."""
+_ROUNDS = 2  # iterations of hull, colours and masks
+_BAND = 2.0  # distance between the edges of object and hull, in voxels
 AROUND = 0.5
 """Width of the surroundings in which background colours are learned, in radii of the silhouette."""
 _LONGEST = 800  # side of the reduced photographs [px]
@@ -65,8 +63,8 @@ def refined_masks(
     Raises:
         InputError: as `common_body`.
     """
-    masks, total = list(masks), ROUNDS * len(masks)
-    for done in range(ROUNDS):
+    masks, total = list(masks), _ROUNDS * len(masks)
+    for done in range(_ROUNDS):
         body = common_body(masks, viewmats, Ks)
         seen = (body.seen(p.shape[:2], *camera) for p, camera in zip(pictures, zip(viewmats, Ks)))
         candidates = (_view(p, *each) for p, each in zip(pictures, seen))
@@ -98,7 +96,7 @@ def _view(picture: np.ndarray, body: np.ndarray, voxel: float) -> _View | None:
     likely = cv2.resize(body.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5
     if not likely.any():
         return None
-    band = max(2, round(BAND * scale * voxel))
+    band = max(2, round(_BAND * scale * voxel))
     box = box_of(likely, band + round(AROUND * radius_of(likely)))
     pixels = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)[box]
     return _View(likely.shape, box, pixels, shrunk(likely, band)[box], grown(likely, band)[box])

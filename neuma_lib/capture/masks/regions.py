@@ -17,17 +17,14 @@ from neuma_lib.errors import InputError
 from neuma_lib.io.files import existing, reading
 from neuma_lib.io.images import open_image
 
-MIN_AREA = 2e-5
-"""Minimum area of an object, as share of the picture."""
+_MIN_AREA = 2e-5  # minimum area of an object, as share of the picture
 MAX_MOVING = 0.1
 """Tolerated share of the picture outside object and shadows that differs from the background."""
 MAX_JUMP = 1.0
 """Tolerated relative change of a mask's area between frames of free flight. 0.03 is usual in sharp pictures, 0.3 with
 blur or a background of similar colour. A larger one means that something else is in the mask."""
-EDGE = 0.7
-"""Standard deviation of the blur that softens a mask's edge [px]."""
-MAX_AREA_RATIO = 3.0
-"""Maximum ratio of areas of the same object from frame to frame."""
+_EDGE = 0.7  # standard deviation of the blur that softens a mask's edge [px]
+_MAX_AREA_RATIO = 3.0  # maximum ratio of areas of the same object from frame to frame
 _GRABCUT_ROUNDS = 4
 
 
@@ -61,7 +58,7 @@ def matted(pixels: np.ndarray, mask: np.ndarray) -> np.ndarray:
     the edge also show the background.
     """
     cv2 = opencv()
-    alpha = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), EDGE)
+    alpha = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), _EDGE)
     inside = ndimage.binary_erosion(mask, iterations=2, border_value=1)
     if not inside.any():
         inside = mask
@@ -111,7 +108,7 @@ def component(
     """The connected component nearest to a position and an area, with holes filled. The largest if neither is given.
 
     With a gate [px], components whose centre is farther from the position, or whose area differs by more than
-    `MAX_AREA_RATIO`, are excluded. Empty if there is none.
+    `_MAX_AREA_RATIO`, are excluded. Empty if there is none.
     """
     labels, sizes, middles = parts_of(strong)
     enough = np.flatnonzero(sizes >= min_area(strong))
@@ -125,7 +122,7 @@ def component(
         distance = np.linalg.norm(middles[enough] - place, axis=1)
         score = score - (distance / (2 * reach)) ** 2
         if gate is not None:
-            other_size = np.abs(np.log(sizes[enough] / area)) > np.log(MAX_AREA_RATIO)
+            other_size = np.abs(np.log(sizes[enough] / area)) > np.log(_MAX_AREA_RATIO)
             score[(distance > gate) | other_size] = -np.inf
     if not np.isfinite(score).any():
         return np.zeros_like(strong)
@@ -186,7 +183,7 @@ def in_full(part: np.ndarray, box: tuple[slice, slice], shape: tuple[int, int]) 
 
 
 def min_area(picture: np.ndarray) -> float:
-    return max(9, MIN_AREA * picture.size)
+    return max(9, _MIN_AREA * picture.size)
 
 
 def whole(mask: np.ndarray) -> bool:

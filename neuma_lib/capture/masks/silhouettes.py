@@ -27,22 +27,17 @@ NOISE = 3.0
 """Minimum standard deviation between a frame and a model: noise of both, and compression [levels]."""
 POSE_TOLERANCE = 0.25
 """Standard deviation of the background's position in the picture [px], relevant at its edges."""
-DARKEST = 0.02
-"""Minimum share of the light that a shadow leaves."""
-TINT = 0.05
-"""Relative standard deviation between the shades of the channels."""
+_DARKEST = 0.02  # minimum share of the light that a shadow leaves
+_TINT = 0.05  # relative standard deviation between the shades of the channels
 BOUNCE = 0.03
 """Standard deviation of light reflected by other surfaces, as share of the light in the empty picture."""
-COLOURS = 24
-"""Number of colours that describe an object."""
+_COLOURS = 24  # number of colours that describe an object
 MIN_SHARE = 0.003
 """Minimum share assumed for a colour. Rare colours cost more."""
 SHADED = (6.0, 2.0)
 """Cost of a shadow, which has many possible shades, and of its depth by the negative logarithm of the shade."""
-LIGHT = (0.6, 1.3)
-"""Range of brightness of the object's colours."""
-LIGHT_WEIGHT = 4.0
-"""Cost of such a change, by its squared logarithm."""
+_LIGHT = (0.6, 1.3)  # range of brightness of the object's colours
+_LIGHT_WEIGHT = 4.0  # cost of such a change, by its squared logarithm
 UNSEEN = 40.0
 """Cost of a colour that neither model explains, in squared standard deviations."""
 MIN_LEARNED = 200
@@ -107,8 +102,8 @@ def learn_palette(
     pixels = pixels[rng.choice(len(pixels), min(len(pixels), 20_000), replace=False)]
     cv2.setRNGSeed(0)
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 30, 0.5)
-    _, labels, colours = cv2.kmeans(pixels, COLOURS, None, criteria, 2, cv2.KMEANS_PP_CENTERS)
-    return Palette(colours, np.bincount(labels.ravel(), minlength=COLOURS) / len(labels))
+    _, labels, colours = cv2.kmeans(pixels, _COLOURS, None, criteria, 2, cv2.KMEANS_PP_CENTERS)
+    return Palette(colours, np.bincount(labels.ravel(), minlength=_COLOURS) / len(labels))
 
 
 def silhouette(frame: np.ndarray, background: np.ndarray, mask: np.ndarray, palette: Palette) -> np.ndarray:
@@ -161,7 +156,7 @@ def _explain_by_background(picture: np.ndarray, background: np.ndarray) -> _Back
     edges = POSE_TOLERANCE * np.hypot(
         *(cv2.Sobel(background, cv2.CV_32F, *axis, scale=1 / 8) for axis in ((1, 0), (0, 1)))
     )
-    lit = ((picture - background) ** 2 / (NOISE**2 + edges**2 + (0.4 * TINT * background) ** 2)).sum(axis=2)
+    lit = ((picture - background) ** 2 / (NOISE**2 + edges**2 + (0.4 * _TINT * background) ** 2)).sum(axis=2)
 
     def window(values: np.ndarray, side: int = _WINDOW) -> np.ndarray:
         return cv2.blur(values, (side, side), borderType=cv2.BORDER_REFLECT_101)
@@ -171,15 +166,15 @@ def _explain_by_background(picture: np.ndarray, background: np.ndarray) -> _Back
         return cv2.warpAffine(values, by, values.shape[1::-1], borderMode=cv2.BORDER_REPLICATE)
 
     def explained(log: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        shade = np.exp(np.clip(log, np.log(DARKEST), 0.0))[..., None]
+        shade = np.exp(np.clip(log, np.log(_DARKEST), 0.0))[..., None]
         expected = shade * full
         slope = _levels_by_light(expected)
-        variance = NOISE**2 + (slope * BOUNCE * full) ** 2 + (slope * TINT * expected) ** 2
+        variance = NOISE**2 + (slope * BOUNCE * full) ** 2 + (slope * _TINT * expected) ** 2
         variance += (edges * shade ** (1 / 2.4)) ** 2
         return ((picture - coded(expected)) ** 2 / variance).sum(axis=2), shade[..., 0]
 
     products = (window((pair).sum(axis=2), 3) for pair in (light * full, full * full))
-    log = np.log(np.clip(np.divide(*products), DARKEST, 1.5))
+    log = np.log(np.clip(np.divide(*products), _DARKEST, 1.5))
     half = _WINDOW // 2
     ramp = np.tile(np.arange(-half, half + 1, dtype=np.float32), (_WINDOW, 1))
     ramp /= (ramp * ramp).sum()
@@ -206,11 +201,11 @@ def _palette_cost(picture: np.ndarray, palette: Palette) -> np.ndarray:
     best = np.full(picture.shape[:2], UNSEEN, np.float32)
     for colour, share in zip(palette.colours, palette.shares):
         own = linear(colour)
-        factor = np.clip((light @ own) / max(own @ own, 1e-9), *LIGHT)[..., None]
+        factor = np.clip((light @ own) / max(own @ own, 1e-9), *_LIGHT)[..., None]
         expected = factor * own
-        variance = 2 * NOISE**2 + (TINT * _levels_by_light(expected) * expected) ** 2
+        variance = 2 * NOISE**2 + (_TINT * _levels_by_light(expected) * expected) ** 2
         cost = ((picture - coded(expected)) ** 2 / variance).sum(axis=2)
-        cost += LIGHT_WEIGHT * np.log(factor[..., 0]) ** 2 - 2 * np.log(max(share, MIN_SHARE))
+        cost += _LIGHT_WEIGHT * np.log(factor[..., 0]) ** 2 - 2 * np.log(max(share, MIN_SHARE))
         np.minimum(best, cost, out=best)
     return best
 

@@ -14,8 +14,7 @@ from neuma_lib.capture.motion.ballistic_tracks import MIN_FRAMES
 from neuma_lib.capture.motion.gravity import Gravity
 from neuma_lib.errors import InputError
 
-MAX_RMS = 0.004
-"""Tolerated root-mean-square residual, as share of the picture height."""
+_MAX_RMS = 0.004  # tolerated root-mean-square residual, as share of the picture height
 MAX_RMS_OF_RADIUS = 0.1
 """The same as share of the object's radius, since the centroid of a mask moves relative to the centre as the object
 turns. Different takes that fit so well are refused by the check of gravity."""
@@ -256,7 +255,7 @@ def fit_flight(
         if growing:
             chosen = [_part(track, *ends) for track, ends in zip(tracks, kept)]
             fall = fit_free_fall(chosen, plane, fall.offsets, fixed)
-    limit = min(max(MAX_RMS * _height(track), MAX_RMS_OF_RADIUS * track.radius) for track in tracks)
+    limit = min(max(_MAX_RMS * _height(track), MAX_RMS_OF_RADIUS * track.radius) for track in tracks)
     if fall.rms > limit:
         raise InputError(
             ", ".join(track.name for track in tracks),

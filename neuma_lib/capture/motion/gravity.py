@@ -17,9 +17,8 @@ from neuma_lib.errors import InputError
 
 UP = (0.0, 1.0, 0.0)
 """The floor's normal in the room."""
-MAX_MISMATCH = 0.1
-"""Tolerated relative difference between measured and true gravity, as a vector."""
-_UNDECIDED = f"more than {MAX_MISMATCH:.0%} off, but within its uncertainty: registration measures it again"
+_MAX_MISMATCH = 0.1  # tolerated relative difference between measured and true gravity, as a vector
+_UNDECIDED = f"more than {_MAX_MISMATCH:.0%} off, but within its uncertainty: registration measures it again"
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +79,7 @@ class Gravity:
         Args:
             name: of the videos.
             normal: of the floor, upward, (3,).
-            tolerated: standard deviations by which the mismatch may exceed `MAX_MISMATCH`, above 0 if a more accurate
+            tolerated: standard deviations by which the mismatch may exceed `_MAX_MISMATCH`, above 0 if a more accurate
                 measurement follows.
 
         Raises:
@@ -88,16 +87,16 @@ class Gravity:
         """
         line, (ratio, _), (angle, _) = self.describe(name, normal), self.ratio, self.angle(normal)
         mismatch, mismatch_std = self.mismatch(normal)
-        if mismatch - tolerated * mismatch_std <= MAX_MISMATCH:
-            return line if mismatch <= MAX_MISMATCH else f"{line}; {_UNDECIDED}"
+        if mismatch - tolerated * mismatch_std <= _MAX_MISMATCH:
+            return line if mismatch <= _MAX_MISMATCH else f"{line}; {_UNDECIDED}"
         causes = []
-        if abs(ratio - 1) > MAX_MISMATCH / 2:
+        if abs(ratio - 1) > _MAX_MISMATCH / 2:
             causes.append(f"the board's square size is {1 / ratio:.2f} of the given one (measure it)")
             causes.append(
                 f"the frame rate is {ratio**-0.5:.2f} of the assumed one (set the true rate of slow motion)"
             )
             causes.append("the time base is not constant (use the original file of the camera)")
-        if angle > np.degrees(MAX_MISMATCH / 2):
+        if angle > np.degrees(_MAX_MISMATCH / 2):
             causes.append("the floor or board is not level, or the camera moved after its pose was estimated")
         if self.several:
             causes.append("the videos show different takes or objects")

@@ -19,12 +19,9 @@ from neuma_lib.capture.masks.regions import radius_of
 from neuma_lib.capture.motion.free_fall import FreeFall, Track
 from neuma_lib.capture.tools import opencv
 
-MAX_FRAMES = 8
-"""Frames over which a point is tracked before its neighbourhood rotates out of view."""
-POINTS = 25
-"""Points tracked from one frame."""
-DEPTH_SPREAD = 0.4
-"""Standard deviation of the depth of a surface from that of a sphere, in radii."""
+_MAX_FRAMES = 8  # frames over which a point is tracked before its neighbourhood rotates out of view
+_POINTS = 25  # points tracked from one frame
+_DEPTH_SPREAD = 0.4  # standard deviation of the depth of a surface from that of a sphere, in radii
 PIXEL_SPREAD = 0.3
 """Standard deviation of a tracked point [px]."""
 _MIN_POINTS = 8
@@ -85,13 +82,13 @@ def follow(frames: Sequence[np.ndarray], masks: np.ndarray, times: np.ndarray, c
     middles = [np.argwhere(mask).mean(axis=0)[::-1] for mask in masks]
     options = {"winSize": (_WINDOW, _WINDOW), "maxLevel": 2, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
     paths = []
-    for first in range(0, len(frames) - 2, max(1, MAX_FRAMES // 2)):
-        features = cv2.goodFeaturesToTrack(grey[first], POINTS, 0.02, 4, mask=inner[first])
+    for first in range(0, len(frames) - 2, max(1, _MAX_FRAMES // 2)):
+        features = cv2.goodFeaturesToTrack(grey[first], _POINTS, 0.02, 4, mask=inner[first])
         if features is None:
             continue
         places = [[p] for p in features.reshape(-1, 2).astype(np.float64)]
         alive = np.arange(len(places))
-        for i in range(first, min(first + MAX_FRAMES, len(frames)) - 1):
+        for i in range(first, min(first + _MAX_FRAMES, len(frames)) - 1):
             here = np.array([places[k][-1] for k in alive], np.float32).reshape(-1, 1, 2)
             if len(here) == 0:
                 break
@@ -154,7 +151,7 @@ def fit_spin(paths: Sequence[Path], tracks: Sequence[Track], fall: FreeFall) -> 
         turned = Rotation.from_rotvec((clock - begin[path])[:, None] * u[:3]).apply(arm)
         x = np.einsum("nij,nj->ni", R[camera[path]], later + turned) + t[camera[path]]
         p = x[:, :2] / x[:, 2:] * K[camera[path]][:, [0, 1], [0, 1]] + K[camera[path], :2, 2]
-        return np.concatenate([((p - seen) / PIXEL_SPREAD).ravel(), u[3:] / DEPTH_SPREAD])
+        return np.concatenate([((p - seen) / PIXEL_SPREAD).ravel(), u[3:] / _DEPTH_SPREAD])
 
     def jacobian(u: np.ndarray) -> np.ndarray:
         # A depth only affects the rows of its path, so one finite difference covers all depths.
@@ -172,13 +169,13 @@ def fit_spin(paths: Sequence[Path], tracks: Sequence[Track], fall: FreeFall) -> 
         change = (residuals(moved) - residuals(back)) / (2 * step)
         rows = np.arange(2 * len(path))
         J[rows, 3 + np.repeat(path, 2)] = change[: 2 * len(path)]
-        J[2 * len(path) + np.arange(len(paths)), 3 + np.arange(len(paths))] = 1 / DEPTH_SPREAD
+        J[2 * len(path) + np.arange(len(paths)), 3 + np.arange(len(paths))] = 1 / _DEPTH_SPREAD
         return J
 
     u = least_squares(residuals, np.zeros(3 + len(paths)), jacobian, loss="soft_l1").x
     errors = residuals(u)[: 2 * len(path)]
     J = jacobian(u)
-    weights = 1 / np.sqrt(1 + np.concatenate([errors, u[3:] / DEPTH_SPREAD]) ** 2)
+    weights = 1 / np.sqrt(1 + np.concatenate([errors, u[3:] / _DEPTH_SPREAD]) ** 2)
     inverse = np.linalg.inv(J.T @ (weights[:, None] * J))
     # All positions of a path share the error of the first, so a path counts as one independent position.
     spread = max(1.0, float(np.median(np.abs(errors)) * 1.4826) ** 2)

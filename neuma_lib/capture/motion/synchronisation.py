@@ -11,8 +11,7 @@ from PIL import Image
 from neuma_lib.capture.motion.timing import row_times
 from neuma_lib.errors import InputError
 
-MIN_FRAMES = 8
-"""Frames after the start required of each camera: fewer show no contact."""
+_MIN_FRAMES = 8  # frames after the start required of each camera: fewer show no contact
 
 
 def frame_times(
@@ -38,13 +37,13 @@ def chosen_frames(times: np.ndarray, duration: float, most: int, name: str) -> n
         name: of take and camera for messages.
 
     Raises:
-        InputError: fewer than `MIN_FRAMES` lie in this interval.
+        InputError: fewer than `_MIN_FRAMES` lie in this interval.
     """
     inside = np.flatnonzero((times >= 0) & (times <= duration))
-    if len(inside) < MIN_FRAMES:
+    if len(inside) < _MIN_FRAMES:
         raise InputError(
             name,
-            f"{len(inside)} frames show the object in the first {duration:g} s of flight, {MIN_FRAMES} are required",
+            f"{len(inside)} frames show the object in the first {duration:g} s of flight, {_MIN_FRAMES} are required",
             "Film until the object rests, increase `duration` in capture.yaml, and check the masks' contact sheet",
         )
     places = np.linspace(0, len(inside) - 1, min(most, len(inside)))

@@ -18,12 +18,10 @@ from neuma_lib.io.files import existing, one_line
 
 RATE = 16_000
 """Sampling rate of the compared sound [Hz]."""
-BAND = (300.0, 6000.0)
-"""Band of claps and impacts, above hum and below the filters of phones [Hz]."""
+_BAND = (300.0, 6000.0)  # band of claps and impacts, above hum and below the filters of phones [Hz]
 SOUND_SPREAD = 0.005
 """Standard deviation of an offset due to the travel time of sound, 2.9 ms per metre, and delays in phones [s]."""
-MIN_PEAK = 6.0
-"""Required height of a correlation peak, relative to the root mean square."""
+_MIN_PEAK = 6.0  # required height of a correlation peak, relative to the root mean square
 MIN_CORRELATION = 0.5
 
 
@@ -71,17 +69,17 @@ def offset_from_sound(
     spectra = [np.fft.rfft(s, size) for s in (first, second)]
     cross = spectra[0] * spectra[1].conj()
     frequencies = np.fft.rfftfreq(size, 1 / rate)
-    band = (frequencies >= BAND[0]) & (frequencies <= BAND[1])
+    band = (frequencies >= _BAND[0]) & (frequencies <= _BAND[1])
     whitened = np.where(band, cross / np.maximum(np.abs(cross), 1e-12 * max(np.abs(cross).max(), 1e-300)), 0)
-    correlation = np.abs(signal.hilbert(np.fft.irfft(whitened, size)))  # envelope, without the carrier
+    correlation = np.abs(signal.hilbert(np.fft.irfft(whitened, size)))  # envelope
     reach = min(int(longest * rate), size // 2 - 2)
     lags = np.arange(-reach, reach + 1)
     values = correlation[lags]
     peak = int(np.argmax(values))
     spread = np.sqrt(np.mean(np.square(values)))
-    if not 0 < peak < len(values) - 1 or values[peak] < MIN_PEAK * spread:
+    if not 0 < peak < len(values) - 1 or values[peak] < _MIN_PEAK * spread:
         return None
-    width = 1 / (BAND[1] - BAND[0])
+    width = 1 / (_BAND[1] - _BAND[0])
     deviation = np.hypot(width, SOUND_SPREAD)
     return Offset(
         float((lags[peak] + _vertex(values[peak - 1 : peak + 2])) / rate), float(deviation), "sound"

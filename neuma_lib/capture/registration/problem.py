@@ -13,8 +13,7 @@ from neuma_lib.capture.registration.rigid_motion import RigidMotion, rotate
 from neuma_lib.capture.registration.rigid_views import LOCAL, Pictures
 from neuma_lib.fitting.least_squares import Linearisation
 
-LIKELY_SPIN = 10.0
-"""Prior standard deviation of the spin of a dropped object [rad/s]."""
+_LIKELY_SPIN = 10.0  # prior standard deviation of the spin of a dropped object [rad/s]
 LIKELY_SIZE, ANY_SIZE = 0.01, 0.3
 """Prior standard deviations of the relative size for a known and for an unknown scale."""
 
@@ -22,7 +21,7 @@ TURN, PLACE, VELOCITY, SPIN, SIZE = slice(0, 3), slice(3, 6), slice(6, 9), slice
 GRAVITY, OFFSETS = slice(13, 16), 16
 """Indices of the unknowns, with those of the offsets from the last one on."""
 _ANY_TURN = np.pi / np.sqrt(3)  # standard deviation of a uniform angle [rad]
-_UNITS = np.array([_ANY_TURN] * 3 + [0.1] * 3 + [1.0] * 3 + [LIKELY_SPIN] * 3)
+_UNITS = np.array([_ANY_TURN] * 3 + [0.1] * 3 + [1.0] * 3 + [_LIKELY_SPIN] * 3)
 _NO_DIRECTIONS = np.zeros((0, 3))
 _GRAVITY_UNIT, _OFFSET_UNIT = 3.0, 0.01  # [m/s^2], [s]
 

@@ -14,8 +14,7 @@ from neuma_lib.capture.registration.rigid_views import Agreement, Comparison
 CLEAR_MARGIN = 0.25
 """Relative increase of the cost of the next distinct pose below which a pose is ambiguous: two standard deviations if
 the residuals of a block count as one (`Linearisation.block_cost`)."""
-CLEAR_ANGLE = 10.0
-"""Standard deviation of the rotation above which it is ambiguous [degrees]."""
+_CLEAR_ANGLE = 10.0  # standard deviation of the rotation above which it is ambiguous [degrees]
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,9 +82,9 @@ class Registration:
         """Description of the ambiguity of the pose, empty if there is none."""
         texts = []
         worst = self.turn_deviations[-1]
-        if worst > CLEAR_ANGLE:
+        if worst > _CLEAR_ANGLE:
             _, vectors = np.linalg.eigh(self.covariance[TURN, TURN])
-            count = int((self.turn_deviations > CLEAR_ANGLE).sum())
+            count = int((self.turn_deviations > _CLEAR_ANGLE).sum())
             axis = ", ".join(f"{x:.2f}" for x in vectors[:, -1])
             axes = (f"the axis ({axis})", "two axes", "any axis")[count - 1]
             texts.append(f"the object looks alike when it is turned about {axes} (+-{worst:.0f} degrees)")

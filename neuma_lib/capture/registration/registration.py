@@ -45,9 +45,8 @@ from neuma_lib.fitting.frame_batches import spread_frames
 from neuma_lib.fitting.least_squares import BLOCKS, MIN_COST, jackknife, levenberg_marquardt
 from neuma_lib.splatting.gaussians import Gaussians
 
-_GRID = (
-    600  # initial rotations, and that of the photographs; every rotation is within 25 degrees of one of them
-)
+# Initial rotations in addition to that of the photographs. Every rotation is within 25 degrees of one of them.
+_GRID = 600
 _DISTINCT = np.radians(15)  # minimum angle between distinct rotations
 _MIN_IOU = 0.8  # mean, of masks and rendered silhouettes
 # Squared spin in standard deviations up to which it is set to 0: 99th percentile of chi-squared with three degrees of

@@ -8,20 +8,14 @@ from typing import Any, NamedTuple
 from neuma_lib.capture.masks.agreement import MIN_AGREEMENT
 from neuma_lib.config.simulation import GRAVITY
 
-MAX_ERROR = 1.0
-"""Mean reprojection error of good photographs [px]."""
+_MAX_ERROR = 1.0  # mean reprojection error of good photographs [px]
 MAX_RESIDUAL = 0.5
 """Distance of the board's corners from the print for a flat board with the correct square size [mm]."""
-MAX_UNSURE = 0.3
-"""Standard deviation of a fixed camera's direction [degrees]."""
-MIN_FLOOR = 0.2
-"""Share of the points on a floor with texture."""
-MAX_LEFT_OUT = 0.1
-"""Share of the photographs whose masks disagree with the others."""
-MAX_JUMP = 0.1
-"""Relative change of a good mask's area from frame to frame of free flight."""
-MIN_OVERLAP = 0.9
-"""IoU of masks from videos with those of the placed object, in free flight."""
+_MAX_UNSURE = 0.3  # standard deviation of a fixed camera's direction [degrees]
+_MIN_FLOOR = 0.2  # share of the points on a floor with texture
+_MAX_LEFT_OUT = 0.1  # share of the photographs whose masks disagree with the others
+_MAX_JUMP = 0.1  # relative change of a good mask's area from frame to frame of free flight
+_MIN_OVERLAP = 0.9  # IoU of masks from videos with those of the placed object, in free flight
 MAX_TURN = 5.0
 """Standard deviation of the object's orientation about its worst axis, for good videos [degrees]."""
 MIN_PSNR = 20.0
@@ -46,20 +40,20 @@ def checks(room: Mapping[str, Any], videos: Mapping[str, Mapping[str, Any]]) -> 
     ]
     if (error := room["reprojection_error_px"]) is not None:
         result.append(
-            Check("reprojection error", f"{error:.2f} px", f"< {MAX_ERROR:g} px", error < MAX_ERROR)
+            Check("reprojection error", f"{error:.2f} px", f"< {_MAX_ERROR:g} px", error < _MAX_ERROR)
         )
     for name, (x, y, turn) in room.get("unsure", {}).items():
         text = f"+-{turn:.2f} degrees, the lens's centre +-{x:.1f} and +-{y:.1f} px"
-        wanted = f"< {MAX_UNSURE:g} degrees"
-        result.append(Check(f"direction of {name.split('/')[0]}", text, wanted, turn < MAX_UNSURE))
+        wanted = f"< {_MAX_UNSURE:g} degrees"
+        result.append(Check(f"direction of {name.split('/')[0]}", text, wanted, turn < _MAX_UNSURE))
     if board := room["board"]:
         residual = board["residual_mm"]
         text = f"{residual:.2f} mm ({board['corners']} corners, {board['pictures']} pictures)"
         wanted = f"< {MAX_RESIDUAL:g} mm"
         result.append(Check("board's corners off the print", text, wanted, residual < MAX_RESIDUAL))
     if (share := room["share_of_points_on_floor"]) is not None:
-        text, wanted = f"{100 * share:.0f} % of the points", f"> {100 * MIN_FLOOR:.0f} %"
-        result.append(Check("floor", text, wanted, share > MIN_FLOOR))
+        text, wanted = f"{100 * share:.0f} % of the points", f"> {100 * _MIN_FLOOR:.0f} %"
+        result.append(Check("floor", text, wanted, share > _MIN_FLOOR))
     for name, video in videos.items():
         slow = f", slowed {video['stretch']:g} times in the file" if video["stretch"] != 1 else ""
         text = f"{video['frames']} at {video['rate']:.2f} a second{slow}"
@@ -80,12 +74,12 @@ def motion_checks(
     count, out = photographs["photographs"], photographs["left_out"]
     text = f"{count - len(out)} of {count}" + (f" (not {', '.join(out)})" if out else "")
     what = f"masks of photographs that agree (IoU > {MIN_AGREEMENT})"
-    result = [Check(what, text, "nearly all", len(out) <= MAX_LEFT_OUT * count)]
+    result = [Check(what, text, "nearly all", len(out) <= _MAX_LEFT_OUT * count)]
     for name, report in videos.items():
         jump = report["largest_jump"]
         text = "no free flight" if jump is None else f"{100 * jump:.1f} %"
-        good = jump is not None and jump < MAX_JUMP
-        result.append(Check(f"area of {name}, frame to frame", text, f"< {100 * MAX_JUMP:.0f} %", good))
+        good = jump is not None and jump < _MAX_JUMP
+        result.append(Check(f"area of {name}, frame to frame", text, f"< {100 * _MAX_JUMP:.0f} %", good))
     for take, flight in flights.items():
         result += [*gravity_checks(f"silhouettes of {take}", flight), *flight_checks(take, flight)]
     return result
@@ -128,9 +122,9 @@ def registration_checks(placed: Mapping[str, Mapping[str, Any]]) -> list[Check]:
         result.append(Check(f"pose of the object in {take}", text, wanted, turn < MAX_TURN))
         result += gravity_checks(take, report)
         for camera, after in report["after"].items():
-            text, wanted = f"IoU {after['iou']:.3f}", f"> {MIN_OVERLAP:g}"
+            text, wanted = f"IoU {after['iou']:.3f}", f"> {_MIN_OVERLAP:g}"
             what = f"placed object in {take}, {camera}"
-            result.append(Check(what, text, wanted, after["iou"] > MIN_OVERLAP))
+            result.append(Check(what, text, wanted, after["iou"] > _MIN_OVERLAP))
     return result
 
 

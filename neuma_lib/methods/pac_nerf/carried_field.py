@@ -114,11 +114,11 @@ class FieldRenderer:
         if x.shape[1:] != moving.shape:
             problem = f"{x.shape[1]} particles must be the {len(moving)} simulated ones of the field"
             raise InputError("rollout", problem, "Run the evaluation again")
-        field, rendered = self.body.field, self.body.rendered
+        field, particles = self.body.field, self.body.rendered
         positions = self.body.positions(x.to(moving))
         views = range(len(self.cameras))
         images = [
-            field.draw(self.cameras, view, replace(rendered, x=at), self.background)
+            field.draw(self.cameras, view, replace(particles, x=at), self.background)
             for at in positions
             for view in views
         ]

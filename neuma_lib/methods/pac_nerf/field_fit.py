@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from neuma_lib.errors import InputError, NonFiniteError
+from neuma_lib.fitting.image_quality import mean_psnr
 from neuma_lib.geometry.visual_hull import Hull, check_masks, visual_hull
 from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.methods.pac_nerf.field import FieldParticles, RadianceField
@@ -112,12 +113,10 @@ def evaluate(
     particles: FieldParticles | None = None,
 ) -> tuple[float, float]:
     """Mean PSNR [dB] over views with respect to RGBA images over white: full frame, and where alpha > 1/2."""
-    full, inside = [], []
-    for view in views:
-        error = (field.draw(cameras, view, particles).clamp(0, 1) - over_white(images[view])) ** 2
-        full.append(-10 * math.log10(float(error.mean())))
-        inside.append(-10 * math.log10(float(error[images[view, ..., 3] > 0.5].mean())))
-    return sum(full) / len(full), sum(inside) / len(inside)
+    errors = (
+        (field.draw(cameras, view, particles).clamp(0, 1) - over_white(images[view])) ** 2 for view in views
+    )
+    return mean_psnr(zip(errors, images[views, ..., 3], strict=True))
 
 
 class _Fit:
@@ -149,7 +148,7 @@ class _Fit:
                 )
             ]
         )
-        self.meeting = [_meeting(field.lattice, *rays) for rays in self.rays]
+        self.meeting = [field.lattice.intersected(*rays).nonzero()[:, 0] for rays in self.rays]
 
     def step(self, iteration: int) -> float:
         """One Adam step."""
@@ -224,14 +223,6 @@ def _around(hull: Hull, settings: RadianceConfig) -> Lattice:
     cells = ((high - low) / voxel).ceil().clamp(min=1)
     origin = (low + high - voxel * cells) / 2
     return Lattice(tuple(origin.tolist()), voxel, tuple(int(n) + 1 for n in cells.tolist()))
-
-
-def _meeting(lattice: Lattice, origins: Tensor, directions: Tensor) -> Tensor:
-    """Indices of the rays that intersect a lattice."""
-    low, high = (torch.tensor(corner).to(origins) for corner in (lattice.origin, lattice.far))
-    one, other = (low - origins) / directions, (high - origins) / directions
-    first, last = torch.minimum(one, other).amax(1), torch.maximum(one, other).amin(1)
-    return (last > first.clamp(min=0)).nonzero()[:, 0]
 
 
 def _check(images: Tensor, cameras: Cameras, held_out: int) -> None:

@@ -56,11 +56,7 @@ class Video:
     def shows_body(self, image: Tensor, view: int, lattice: Lattice) -> Tensor:
         """Indices of the pixels of an image that are not white, or whose ray intersects a lattice."""
         coloured = (image < 1 - 1 / 512).any(-1)
-        origins, directions = self.rays[view]
-        low, high = (torch.tensor(corner).to(origins) for corner in (lattice.origin, lattice.far))
-        one, other = (low - origins) / directions, (high - origins) / directions
-        first, last = torch.minimum(one, other).amax(1), torch.maximum(one, other).amin(1)
-        return (coloured | (last > first.clamp(min=0))).nonzero()[:, 0]
+        return (coloured | lattice.intersected(*self.rays[view])).nonzero()[:, 0]
 
     def error(
         self,

@@ -61,6 +61,13 @@ class Lattice:
         ]
         return torch.stack(torch.meshgrid(*ticks, indexing="ij"), dim=-1)
 
+    def intersected(self, origins: Tensor, directions: Tensor) -> Tensor:
+        """Whether rays (P, 3) from their origins on intersect the lattice, shape (P,)."""
+        low, high = (torch.tensor(corner).to(origins) for corner in (self.origin, self.far))
+        one, other = (low - origins) / directions, (high - origins) / directions
+        first, last = torch.minimum(one, other).amax(1), torch.maximum(one, other).amin(1)
+        return last > first.clamp(min=0)
+
     def place(self, dtype: torch.dtype):
         """The lattice as a struct for kernels."""
         t = lattice_types(dtype)

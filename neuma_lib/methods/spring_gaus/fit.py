@@ -7,8 +7,6 @@ one step for the whole video with the gradient through all substeps.
 
 from __future__ import annotations
 
-import copy
-import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -122,6 +120,7 @@ def fit_springs(
 class _Loop(TrainingLoop):
     """State of the fit, and one pass over the video."""
 
+    NAME = "springs"
     RETURN = "back to iteration"
 
     def __init__(self, model, body, springs, start, loss, settings, options, log):
@@ -134,12 +133,12 @@ class _Loop(TrainingLoop):
         springs.log_damping.requires_grad_(options.learn_resistance)
         springs.gap.requires_grad_(options.learn_gap)
         rates = {"log_damping": 0.1 * options.lr_springs, "gap": 0.03 * options.lr_springs}
-        groups = [
-            {"params": p, "lr": rate, "base_lr": rate}
+        self.model_parts = {"springs": springs}
+        self.optimizer = self._adam(
+            (p, rate)
             for name, p in springs.named_parameters()
             if p.requires_grad and (rate := rates.get(name, options.lr_springs))
-        ]
-        self.optimizer = torch.optim.Adam(groups, betas=settings.betas)
+        )
         self._begin(SpringHistory())
 
     def advance(self) -> None:
@@ -152,7 +151,7 @@ class _Loop(TrainingLoop):
             self.best = self._better_state(value)
             self._record(value)
             self.first_loss = self.first_loss or max(value, 1e-30)
-            self._set_rates()
+            self._set_rates(self.iteration, self.settings.iterations)
             if self.options.truncated:
                 self._frame_by_frame()
             else:
@@ -193,38 +192,24 @@ class _Loop(TrainingLoop):
         self.optimizer.zero_grad(set_to_none=True)
         (loss / self.first_loss).backward()
         parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
-        norm = torch.nn.utils.clip_grad_norm_(parameters, self.settings.gradient_clip)
-        if not math.isfinite(norm):
-            raise NonFiniteError("springs", f"the gradient is not finite at iteration {self.iteration}")
+        self._clip_gradients(parameters, "the")
         self.optimizer.step()
-
-    def _set_rates(self) -> None:
-        s = self.settings
-        cosine = (1 + math.cos(math.pi * self.iteration / max(1, s.iterations))) / 2
-        schedule = s.lr_floor + (1 - s.lr_floor) * cosine
-        for group in self.optimizer.param_groups:
-            group["lr"] = group["base_lr"] * self.lr_scale * schedule
 
     def _record(self, value: float) -> None:
         history = self.history
         history.loss.append(value)
         history.modulus.append(self.springs.modulus(self.density))
         history.softness.append(float(self.springs.softness.detach()))
-        for curve, number in zip(
-            (history.resistance, history.friction, history.gap), self.springs.shared(), strict=True
-        ):
-            curve.append(number)
+        resistance, friction, gap = self.springs.shared()
+        history.resistance.append(resistance)
+        history.friction.append(friction)
+        history.gap.append(gap)
         history.substeps.append(self.model.substeps)
         history.lr_scale.append(self.lr_scale)
 
     def _snapshot(self) -> dict:
-        return {
-            "springs": copy.deepcopy(self.springs.state_dict()),
-            "optimizer": copy.deepcopy(self.optimizer.state_dict()),
-            "substeps": self.model.substeps,
-        }
+        return {**super()._snapshot(), "substeps": self.model.substeps}
 
     def _restore(self, state: dict) -> None:
-        self.springs.load_state_dict(state["springs"])
-        self.optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))
+        super()._restore(state)
         self.model = replace(self.model, substeps=state["substeps"])

@@ -30,7 +30,7 @@ def data(inputs, params, log) -> ImageGrid:
     blocks, times, measures = [], [], []
     rollouts, files_of_measures = iter(inputs.rollouts), iter(inputs.measures)
     for k, setting in enumerate(params.scenes.values()):
-        (video,) = load_videos(inputs.display[k], [params.view], **setting["exposure"])
+        (video,) = load_videos(inputs.shown[k], [params.view], **setting["exposure"])
         files = (inputs.particles[k], inputs.binding[k], inputs.gaussians[k])
         picked = rendering.evenly(params.frames, len(video.frames))
         seen = video.select(picked)

@@ -1,0 +1,54 @@
+"""Loss and PSNR of rendered images, as in 3D Gaussian Splatting."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor
+
+
+def mean_psnr(views: Iterable[tuple[Tensor, Tensor]]) -> tuple[float, float]:
+    """Mean PSNR [dB] over views, full frame and inside the object (alpha > 1/2); NaN without views.
+
+    Args:
+        views: squared error (H, W, 3) and alpha (H, W) of each view.
+    """
+    full, inside = [], []
+    for error, alpha in views:
+        full.append(-10 * math.log10(float(error.mean())))
+        inside.append(-10 * math.log10(float(error[alpha > 0.5].mean())))
+    return (sum(full) / len(full), sum(inside) / len(inside)) if full else (math.nan, math.nan)
+
+
+def image_loss(pictures: Tensor, targets: Tensor, ssim_weight: float) -> Tensor:
+    """(1 - w) L1 + w (1 - SSIM) of (B, H, W, 3) images, as in 3D Gaussian Splatting."""
+    l1 = (pictures - targets).abs().mean()
+    if ssim_weight == 0:
+        return l1
+    return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim_map(pictures, targets).mean())
+
+
+def ssim_map(a: Tensor, b: Tensor, sigma: float = 1.5, radius: int = 5) -> Tensor:
+    """SSIM (B, 3, H, W) of (B, H, W, 3) images in [0, 1]: 11 x 11 Gaussian window, zeros outside.
+
+    The window is applied as two banded matrices by GEMM, which is faster than a small convolution.
+    """
+    a, b = (image.movedim(-1, 1) for image in (a, b))
+    rows, columns = (_window(n, sigma, radius, a.dtype, a.device) for n in a.shape[-2:])
+    maps = rows @ torch.stack([a, b, a * a, b * b, a * b]) @ columns.mT
+    mean_a, mean_b, aa, bb, ab = maps
+    product, squares = mean_a * mean_b, mean_a * mean_a + mean_b * mean_b
+    c1, c2 = 0.01**2, 0.03**2
+    return (2 * product + c1) * (2 * (ab - product) + c2) / ((squares + c1) * (aa + bb - squares + c2))
+
+
+@functools.lru_cache(maxsize=8)
+def _window(size: int, sigma: float, radius: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    positions = torch.arange(size, dtype=torch.float64)
+    offsets = positions[:, None] - positions
+    weights = torch.exp(-(offsets**2) / (2 * sigma**2)) * (offsets.abs() <= radius)
+    full = torch.exp(-(torch.arange(-radius, radius + 1, dtype=torch.float64) ** 2) / (2 * sigma**2)).sum()
+    return (weights / full).to(device, dtype)
