@@ -15,12 +15,11 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 from neuma_lib.evaluation.bands import envelope
 from neuma_lib.evaluation.plotting import style
 from neuma_lib.evaluation.response import inside
-from neuma_lib.evaluation.stress_curves import VISITED
+from neuma_lib.evaluation.stress_curves import HEADROOM, draw_laws, draw_visited, set_limits
 from neuma_lib.io.files import read_json
 
 TESTS = {
@@ -28,8 +27,6 @@ TESTS = {
     "shear": ("elastic shear", "shear stress"),
     "yield": ("total shear", "shear stress"),
 }
-HEADROOM = 0.6
-"""Limit of the curves of compared laws beyond those of the truth, relative to the range of the truth."""
 
 
 def data(inputs, params, log) -> dict:
@@ -100,27 +97,14 @@ def draw(data: Mapping) -> Figure:
 
 def _curves(axes, test: str, values: Mapping, titles: Mapping[str, str]) -> None:
     x, true = np.asarray(values["x"]), 1e-3 * np.asarray(values["true"])
-    low, high = values["visited"]
-    span = axes.axhspan if values["by_stress"] else axes.axvspan
-    scale = 1e-3 if values["by_stress"] else 1.0
-    span(scale * low, scale * high, color=VISITED, linewidth=0, label="visited in the video")
+    draw_visited(axes, values["visited"], values["by_stress"], label="visited in the video")
     axes.plot(x, true, color=style.GREY, linewidth=2.4, label="true law")
-    curves = [true]
-    for law, entry in values["laws"].items():
-        line = style.look(law).line
-        if entry["band"]:
-            ends = [1e-3 * np.asarray(entry["band"][key]) for key in ("low", "high")]
-            axes.fill_between(entry["band"]["x"], *ends, color=line["color"], alpha=0.18, linewidth=0)
-        curves.append(1e-3 * np.asarray(entry["stress"]))
-        axes.plot(x, curves[-1], **line, label=titles[law])
+    draw_laws(axes, values, titles)
+    curves = [true, *(1e-3 * np.asarray(law["stress"]) for law in values["laws"].values())]
     room = HEADROOM * (np.ptp(true) or 1.0)
-    ends = max(np.min(curves), true.min() - room), min(np.max(curves), true.max() + room)
-    margin = 0.08 * (ends[1] - ends[0] or 1.0)
-    axes.set(xlim=(x.min(), x.max()), ylim=(ends[0] - margin, ends[1] + margin))
-    axes.axhline(0, color=style.GREY, linewidth=0.4, zorder=0.5)
+    set_limits(axes, x, max(np.min(curves), true.min() - room), min(np.max(curves), true.max() + room))
     axes.set_xticks(_ticks(test, x))
     axes.xaxis.set_major_formatter("{x:g}")
-    axes.yaxis.set_major_locator(MaxNLocator(4))
 
 
 def _ticks(test: str, x: np.ndarray) -> list[float]:
