@@ -167,8 +167,13 @@ def test_camera_angle_and_own_intrinsics_of_a_frame(image_set):
     [
         (lambda d: [d.pop(k) for k in ("fl_x", "fl_y")], "transforms.json: frame 0 (d_1_005.png)"),
         (lambda d: d.update(fl_x=-3), "frame 0 (d_1_005.png): fl_x"),
+        (lambda d: d.update(frames=[]), "transforms.json: frames"),
+        (lambda d: d["frames"][2].pop("file_path"), "transforms.json: frame 2"),
         (lambda d: d["frames"][2].pop("transform_matrix"), "frame 2 (d_1_000.png): transform_matrix"),
-        (lambda d: d["frames"][1].update(transform_matrix=(2 * np.eye(4)).tolist()), "transform_matrix"),
+        (
+            lambda d: d["frames"][1].update(transform_matrix=(2 * np.eye(4)).tolist()),
+            "frame 1 (d_0_005.png): transform_matrix",
+        ),
         (lambda d: d.update(w=32), "w, h of d_1_005.png"),
     ],
 )
@@ -247,6 +252,10 @@ def test_bad_meshes(tmp_path):
         with refused("mesh.ply", problem=problem):
             read_mesh(path)
     assert len(read_mesh(path, watertight=False).faces) == 11
+    for content, problem in ((path.read_bytes()[:-7], "claims"), (b"solid nothing", "no header")):
+        path.write_bytes(content)
+        with refused("mesh.ply", problem=problem):
+            read_mesh(path, watertight=False)
 
 
 # ---- Gaussians

@@ -128,6 +128,7 @@ PAC_MISTAKES = [
 SPRING_MISTAKES = [
     (lambda e: e[1].pop("camera"), "camera.json: entry 1: camera"),
     (lambda e: e[1].pop("K"), "entry 1 (camera_01): K"),
+    (lambda e: e[1]["K"][0].__setitem__(1, 1.0), "entry 1 (camera_01): K"),  # skew
     (lambda e: e[1].update(camera="nowhere"), "nowhere/000.png"),
 ]
 
