@@ -47,6 +47,8 @@ MISTAKES = [
     ({"trianing": {}}, "trianing"),
     ({"training": {"lr_elastc": 1}}, "training.lr_elastc"),
     ({"training": {"iterations": "many"}}, "training.iterations"),
+    ({"training": {"rank": 0}}, "training.rank"),
+    ({"binding": {"confidence": 95}}, "binding.confidence"),
     ({"dataset": {"static": {"veiws": 3}}}, "dataset.static.veiws"),
     ({"scenes": {"BouncyBall": {"hieght": 1}}}, "scenes.BouncyBall.hieght"),
     ({"scenes": {"BouncyBall": {"prior": "jely"}}}, "scenes.BouncyBall.prior"),
