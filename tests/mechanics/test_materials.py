@@ -537,6 +537,10 @@ def test_rank_must_be_a_positive_integer():
 # ------------------------------------------------------------------------------------------ files and specs
 
 
+def test_names_of_layers_are_those_of_the_released_files():
+    assert LAYER_KEYS == ("layers.0.fc.weight", "layers.1.fc.weight", "final_layer.fc.weight")
+
+
 def test_prior_files_round_trip(tmp_path):
     law = neural_law(seed=5)
     own = tmp_path / "jelly.safetensors"
