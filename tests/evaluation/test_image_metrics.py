@@ -101,6 +101,8 @@ def test_measures_are_those_of_scikit_image_inside_the_window():
         use_sample_covariance=False,
     )
     assert metrics["ssim"] == pytest.approx(expected)
+    same = image_metrics(image, alpha, image, mask, {}, margin=0.1)
+    assert same["psnr"] == float("inf") and same["ssim"] == pytest.approx(1.0)
     # Nothing outside the window counts.
     image[:14], alpha[:14] = 0.0, 0.0
     assert image_metrics(image, alpha, reference, mask, {}, margin=0.1) == metrics

@@ -80,13 +80,6 @@ def test_four_of_five_are_asked(close, word):
     assert f"**{word}**" in error
 
 
-def test_groups_are_scored_separately():
-    scenes = [scene(HENCKY, "hencky", group="a"), scene(HENCKY, "neo_hookean", group="b")]
-    text = identified_table(scenes)[1]
-    assert "| a: the family is right" in text and "| b: the family is right" in text
-    assert "1 of 1" in text and "0 of 1" in text
-
-
 def test_nothing_identified_is_an_error():
     with refused("tables.table1"):
         identified_table([])
