@@ -1,4 +1,4 @@
-"""Errors of stresses: exact where the difference of two laws is known; states as they occur; table and targets."""
+"""Errors of stresses with closed forms, states of a motion, and the table with its claims."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def plastic():
     return of(hencky(yield_stress=YIELD))
 
 
-def test_states_are_of_the_motion_after_contact(plastic):
+def test_states_are_after_contact(plastic):
     truth = hencky(yield_stress=YIELD)
     assert plastic.F.shape == (400, 3, 3) and plastic.C.shape == (61, 50, 3, 3)
     assert plastic.frames and set(plastic.frames) <= set(FRAMES)
@@ -81,7 +81,7 @@ def test_the_true_law_has_no_error(plastic):
     assert errors["broken_paths"] == 0 and errors["asymmetric"] < 1e-12 and errors["true_rms"] > 10
 
 
-def test_a_law_that_is_twice_as_stiff_is_wrong_by_its_whole_stress(elastic):
+def test_error_of_double_stiffness_is_the_stress(elastic):
     errors = stress_errors(hencky(2 * E), hencky(), elastic, MODEL.dt)
     assert all(errors[part] == pytest.approx(1.0, rel=1e-9) for part in PARTS)
 
@@ -96,7 +96,7 @@ def test_volumetric_and_deviatoric_parts_are_distinguished(elastic):
     assert 0 < errors["stress"] < 0.5 and errors["returned"] == pytest.approx(errors["stress"], rel=1e-2)
 
 
-def test_flow_is_scored_by_the_stress_along_paths():
+def test_flow_affects_the_stress_along_paths():
     """A steady shear far beyond yield: half the stiffness is half the stress of an elastic state, and the same flow."""
     dt, steps = 1e-3, 200
     C = torch.zeros(steps + 1, 2, 3, 3, dtype=torch.float64)
@@ -147,7 +147,7 @@ def test_stress_that_is_not_symmetric(elastic):
     assert errors["volumetric"] < 1e-12
 
 
-def test_a_body_that_touches_nothing_has_no_stresses_to_compare():
+def test_a_motion_without_contact_is_refused():
     with refused("frames"):
         visit(MODEL, hencky(), ball().state(V0), (0, 1), 10, 10, seed=0)
 

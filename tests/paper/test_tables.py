@@ -51,7 +51,7 @@ def test_a_method_that_knows_the_truth_wins_nothing():
     assert "| True law | 1.0 | 1.0 | 2.0 | 3.0 |  |" in table.markdown()
 
 
-def test_what_would_be_zero_is_less_than_the_last_digit():
+def test_numbers_that_round_to_zero_are_below_the_last_digit():
     assert [shown(x, 2) for x in (0.0, 0.004, 0.0051, -0.001, 1.0)] == [
         "< 0.01",
         "< 0.01",
@@ -62,7 +62,7 @@ def test_what_would_be_zero_is_less_than_the_last_digit():
     assert shown(0.04, 1) == "< 0.1"
 
 
-def test_paper_averages_are_those_printed_there():
+def test_averages_equal_those_printed_in_the_paper():
     printed = {
         "table1": {"pac_nerf": 114.80, "nclaw": 12.18, "neuma": 1.31, "neuma_particle_supervision": 1.51,
                    "neuma_without_binding_own": 6.60, "neuma_without_adaptor": 1.79},
@@ -74,7 +74,7 @@ def test_paper_averages_are_those_printed_there():
             assert np.mean(PAPER[table].rows[method]) == pytest.approx(average, abs=7e-3), method
 
 
-def test_tables_of_the_paper_are_whole():
+def test_tables_of_the_paper_are_complete():
     settings = load(yaml.safe_load((ROOT / "config" / "config.yaml").read_text()), ROOT)
     for name, paper in PAPER.items():
         table = settings.tables[name]
@@ -100,7 +100,7 @@ def test_diverged_runs_are_listed_in_the_csv():
 @pytest.mark.parametrize(
     ("failing", "word"), [({}, "holds"), ({"letter_N_jelly_fast": BROKEN}, "does not hold")]
 )
-def test_that_no_letter_breaks_off_is_scored_by_all_of_them(failing, word):
+def test_claim_that_no_letter_breaks_off_counts_all_letters(failing, word):
     columns = dict.fromkeys(PAPER["letters"].columns, "")
     metrics = {"neuma_structured": {c: [run(2.0), run(2.1), run(2.2, **failing.get(c, {}))] for c in columns}}
     table = chamfer_table(metrics, {"neuma_structured": "ours"}, columns, PAPER["letters"])
@@ -186,14 +186,14 @@ def test_a_claim_about_groups_is_one_about_all_their_pairs():
     assert verdict_on(claim, errors | {"neuma": [[1] * 3, [-8, 1, 10]]}).word == "mixed"
 
 
-def test_a_held_motion_proves_nothing_for_its_method():
+def test_a_prediction_that_stops_early_cannot_support_a_claim():
     errors = {"nclaw": [[9, 9, 9]] * 2, "neuma": [[1, 1, 1]] * 2}
     verdict = verdict_on(CLOSER, errors, neuma=BROKEN)
     assert verdict.word == "mixed" and verdict.here.endswith("; a prediction broke off")
     assert verdict_on(CLOSER, errors, nclaw=BROKEN).word == "holds", "its error is even larger"
 
 
-def test_verdicts_stand_in_the_table_if_its_rows_do():
+def test_claims_without_rows_have_no_verdict():
     claims = (CLOSER, Closer("nobody runs this", ("neuma",), ("pac_nerf",)))
     paper = PaperTable("tab:x", "X", "x", claims=claims)
     metrics = {method: {c: [run(value)] for c in AB} for method, value in (("nclaw", 1.0), ("neuma", 2.0))}

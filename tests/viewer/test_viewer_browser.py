@@ -18,7 +18,7 @@ from tests.support.viewer_project import SCENE, STEPS, make_project, make_splat
 OF_VISER = "THREE.BufferGeometry.computeBoundingSphere(): Computed radius is NaN"
 """The message of viser's client 1.1.1 for every scene with splats, once: it draws them on quads whose corners have two
 coordinates, of which three.js wants the bounding sphere. Without a sphere it draws them always, as it should. Once
-`test_viser_alone_reports_it` fails, this exception can go."""
+`test_viser_reports_the_message_itself` fails, this exception can go."""
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +27,7 @@ def folder(tmp_path_factory):
 
 
 def picture(page, selector="canvas"):
-    """What is on the screen, RGB."""
+    """Screenshot of an element, RGB."""
     page.wait_for_timeout(150)
     shot = page.locator(selector).first.screenshot()
     return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB")).astype(int)
@@ -124,7 +124,7 @@ def served(folder):
 
 
 @pytest.mark.slow
-def test_the_server_plays_moves_and_simulates(served):
+def test_the_server_plays_and_simulates(served):
     assert served.host == "127.0.0.1", "this machine alone, by default"
     with opened(f"http://127.0.0.1:{served.port}", 800, 600) as (page, complaints):
         page.wait_for_selector("text=next to it", timeout=60_000)
@@ -175,8 +175,8 @@ def test_the_server_plays_moves_and_simulates(served):
 
 
 @pytest.mark.slow
-def test_viser_alone_reports_it():
-    """A Gaussian, and nothing of ours."""
+def test_viser_reports_the_message_itself():
+    """A scene of one Gaussian, without code of this project."""
     viser = pytest.importorskip("viser")
     server = viser.ViserServer(port=8470, verbose=False)
     one = np.ones((1, 3), np.float32)
