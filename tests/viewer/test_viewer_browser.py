@@ -33,6 +33,23 @@ def picture(page, selector="canvas"):
     return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB")).astype(int)
 
 
+def first_picture(page):
+    """The picture of a file's page that is ready."""
+    page.wait_for_selector("body[data-state=ready]")
+    first = picture(page)
+    assert differ(first, np.full_like(first, 255)) > 0.02, "something is drawn"
+    return first
+
+
+def check_playback(page, first):
+    """Play the first frames slowly."""
+    page.select_option("#pace", "0.03125")
+    page.click("#play")
+    page.wait_for_selector("body[data-frame='2']", timeout=10_000)
+    page.click("#play")
+    assert differ(first, picture(page)) > 0.005, "it plays"
+
+
 def differ(a, b):
     """Share of pixels that are not the same."""
     return float((np.abs(a - b).max(axis=-1) > 8).mean())
@@ -43,8 +60,7 @@ def test_the_file_opens_without_a_server_plays_and_follows_its_controls(folder, 
     with opened((tmp_path / "viewer.html").as_uri()) as (page, complaints):
         page.wait_for_selector("body[data-state=ready]")
         page.select_option("#right", "")  # one motion: the truth alone
-        first = picture(page)
-        assert differ(first, np.full_like(first, 255)) > 0.02, "something is drawn"
+        first = first_picture(page)
 
         def at(frame):
             page.evaluate(
@@ -57,13 +73,7 @@ def test_the_file_opens_without_a_server_plays_and_follows_its_controls(folder, 
         assert differ(first, last) > 0.01, "the slider moves pixels"
         assert differ(first, at(0)) == 0, "and back"
         assert page.inner_text("#clock") == "0 ms"
-
-        page.select_option("#pace", "0.03125")
-        page.click("#play")
-        page.wait_for_selector("body[data-frame='2']", timeout=10_000)
-        page.click("#play")
-        assert differ(first, picture(page)) > 0.005, "it plays"
-
+        check_playback(page, first)
         seen = at(0)
         pictures = {name: None for name in ("speed", "von_mises", "plastic_strain", "volume_ratio")}
         for name in pictures:
@@ -96,15 +106,8 @@ def test_the_file_of_a_splat_has_the_motion_of_its_law_alone_and_plays(tmp_path)
     assert scene.steps == tuple(2 * step for step in STEPS)  # its steps are half as long as those of the law
     write_page(tmp_path / "viewer.html", scene)
     with opened((tmp_path / "viewer.html").as_uri()) as (page, complaints):
-        page.wait_for_selector("body[data-state=ready]")
+        check_playback(page, first_picture(page))
         assert page.locator("#left option").all_inner_texts() == [scene.motions[0].title]
-        first = picture(page)
-        assert differ(first, np.full_like(first, 255)) > 0.02, "something is drawn"
-        page.select_option("#pace", "0.03125")
-        page.click("#play")
-        page.wait_for_selector("body[data-frame='2']", timeout=10_000)
-        page.click("#play")
-        assert differ(first, picture(page)) > 0.005, "it plays"
         page.select_option("#show", "von_mises")
         assert page.is_visible("#legend")
         assert not complaints
