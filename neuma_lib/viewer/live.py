@@ -133,6 +133,7 @@ class LiveSimulation:
 
     Attributes:
         floor: rotation (3, 3) of the box.
+        snapshot: the last one.
     """
 
     def __init__(self, constants: Mapping[str, Any], start: State, law: Law, dt: float):
@@ -161,16 +162,11 @@ class LiveSimulation:
         self._commands.put(lambda: None)
         self._thread.join(timeout=10)
 
-    @property
-    def snapshot(self) -> Snapshot:
-        """The last snapshot."""
-        return self._snapshot
-
     def wait(self, number: int, timeout: float = 10.0) -> Snapshot:
         """Wait for a snapshot with at least this number, or return the last one after a timeout [s]."""
         with self._news:
-            self._news.wait_for(lambda: self._snapshot.number >= number, timeout)
-            return self._snapshot
+            self._news.wait_for(lambda: self.snapshot.number >= number, timeout)
+            return self.snapshot
 
     def do(self, timeout: float = 10.0) -> Snapshot:
         """Wait until all previous commands are executed, and return the next snapshot."""
@@ -179,7 +175,7 @@ class LiveSimulation:
         try:
             return self.wait(reached.get(timeout=timeout), timeout)
         except queue.Empty:
-            return self._snapshot
+            return self.snapshot
 
     @_queued
     def reset(self) -> None:
@@ -361,7 +357,7 @@ class LiveSimulation:
         )  # fmt: skip
         self._number += 1
         with self._news:
-            self._snapshot = snapshot
+            self.snapshot = snapshot
             self._news.notify_all()
 
     def _restart(self) -> None:

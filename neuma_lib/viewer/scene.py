@@ -99,14 +99,6 @@ class Scene:
         """Steps of the frames on the slider: those of the motion with most frames."""
         return max((motion.steps for motion in self.motions), key=len)
 
-    def motion(self, name: str) -> Motion:
-        """The motion with a name. Raises InputError if there is none."""
-        for motion in self.motions:
-            if motion.name == name:
-                return motion
-        known = ", ".join(motion.name for motion in self.motions)
-        raise InputError(self.name, f"has no motion '{name}', only {known}")
-
 
 def frame_at(steps: tuple[int, ...], step: int) -> int:
     """Index of the last frame at or before a step, or of the first frame."""

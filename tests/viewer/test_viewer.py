@@ -30,6 +30,10 @@ def scene(folder):
     return load_scene(find_scene(folder)[1])
 
 
+def motion_of(scene, name):
+    return next(motion for motion in scene.motions if motion.name == name)
+
+
 def stretched(a):
     """A stretch that keeps the volume, e^a along x, turned about z."""
     c, s = np.cos(0.7), np.sin(0.7)
@@ -84,11 +88,11 @@ def test_a_folder_gives_truth_and_methods_with_gaussians_that_follow(scene):
     wanted = 0.5 + (scene.gaussians.means - 0.5) @ STRETCH.T - torch.tensor([0.0, FALL, 0.0])
     A = STRETCH @ scene.gaussians.covars() @ STRETCH.T
     for name in ("truth", "constants"):  # both follow affine motions exactly
-        motion = scene.motion(name)
+        motion = motion_of(scene, name)
         assert torch.allclose(motion.means[-1], wanted, atol=2e-6)
         assert torch.allclose(motion.covars[-1], A, atol=1e-8)
         assert set(motion.scalars) == set(scalars.QUANTITIES)
-    true, result = (scene.motion(name).scalars for name in ("truth", "constants"))
+    true, result = (motion_of(scene, name).scalars for name in ("truth", "constants"))
     for name in ("von_mises", "volume_ratio"):  # the same law and deformation
         assert torch.allclose(true[name][-1].mean(), result[name][-1].mean(), rtol=1e-5)
     assert true["speed"].allclose(torch.tensor(3.0).sqrt()), "the stored velocities"
@@ -100,9 +104,9 @@ def test_a_law_of_another_time_step_is_shown_at_the_same_times(tmp_path, scene):
     arrays, attributes = read_arrays(place / "nclaw" / "rollout.h5", ("x", "F", "frames"))
     refined = {**arrays, "frames": 2 * arrays["frames"]}
     write_arrays(place / "nclaw" / "rollout.h5", refined, {"dt": attributes["dt"] / 2})
-    again = load_scene(find_scene(place)[1]).motion("nclaw")
-    assert again.steps == scene.motion("nclaw").steps
-    assert torch.allclose(again.scalars["speed"], scene.motion("nclaw").scalars["speed"])
+    again = motion_of(load_scene(find_scene(place)[1]), "nclaw")
+    assert again.steps == motion_of(scene, "nclaw").steps
+    assert torch.allclose(again.scalars["speed"], motion_of(scene, "nclaw").scalars["speed"])
 
 
 def test_cameras_have_their_images(scene):
@@ -189,7 +193,7 @@ def test_quantised_values_are_clipped():
 
 
 def test_roots_are_square_roots_of_covariances(scene):
-    covars = scene.motion("truth").covars
+    covars = motion_of(scene, "truth").covars
     a, b, c, d, e, f = roots(covars).transpose(1, 0, 2)
     half = np.stack([[a, b, c], [b, d, e], [c, e, f]]).transpose(2, 3, 0, 1)
     assert np.allclose(half @ half, covars.numpy(), atol=1e-9)
