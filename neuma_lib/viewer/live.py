@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from neuma_lib.errors import InputError, NonFiniteError
@@ -102,10 +103,7 @@ def _check_steps(laws: Sequence[Law], dts: Sequence[float]) -> None:
 
 def tilted(about_x: float, about_z: float) -> np.ndarray:
     """Rotation (3, 3) of a box with its floor tilted about the axes x and z [degrees]."""
-    a, b = np.radians([about_x, about_z])
-    x = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
-    z = np.array([[np.cos(b), -np.sin(b), 0], [np.sin(b), np.cos(b), 0], [0, 0, 1]])
-    return z @ x
+    return Rotation.from_euler("xz", [about_x, about_z], degrees=True).as_matrix()
 
 
 def _queued(command: Callable[..., None]) -> Callable[..., None]:
