@@ -105,7 +105,7 @@ def draw(grid: ImageGrid) -> Figure:
         axes.grid(axis="y")
         if first == 0:
             spacing = {"columnspacing": 1.2, "handlelength": 1.6, "borderaxespad": 0.1}
-            chosen = axes.get_legend_handles_labels()
-            figure.legend(*chosen, loc="upper center", ncols=len(weights) + 1, **spacing)
+            entries = axes.get_legend_handles_labels()
+            figure.legend(*entries, loc="upper center", ncols=len(weights) + 1, **spacing)
         top, first = top + block, first + scene["rows"]
     return figure

@@ -110,16 +110,16 @@ def _curves(axes, test: str, values: Mapping, titles: Mapping[str, str]) -> None
     scale = 1e-3 if values["by_stress"] else 1.0
     span(scale * low, scale * high, color=VISITED, linewidth=0, label="visited in the video")
     axes.plot(x, true, color=style.GREY, linewidth=2.4, label="true law")
-    chosen = [true]
+    curves = [true]
     for law, entry in values["laws"].items():
         line = style.look(law).line
         if entry["band"]:
             ends = [1e-3 * np.asarray(entry["band"][key]) for key in ("low", "high")]
             axes.fill_between(entry["band"]["x"], *ends, color=line["color"], alpha=0.18, linewidth=0)
-        chosen.append(1e-3 * np.asarray(entry["stress"]))
-        axes.plot(x, chosen[-1], **line, label=titles[law])
+        curves.append(1e-3 * np.asarray(entry["stress"]))
+        axes.plot(x, curves[-1], **line, label=titles[law])
     room = HEADROOM * (np.ptp(true) or 1.0)
-    ends = max(np.min(chosen), true.min() - room), min(np.max(chosen), true.max() + room)
+    ends = max(np.min(curves), true.min() - room), min(np.max(curves), true.max() + room)
     margin = 0.08 * (ends[1] - ends[0] or 1.0)
     axes.set(xlim=(x.min(), x.max()), ylim=(ends[0] - margin, ends[1] + margin))
     axes.axhline(0, color=style.GREY, linewidth=0.4, zorder=0.5)
