@@ -224,7 +224,7 @@ def _log_moduli(fit: Mapping[str, Any], dt: float, model_std: float) -> tuple[li
     family = Family("drawn", fit["law"])
     u = np.array(fit["unbounded"]["values"])
 
-    def logs(point: np.ndarray) -> dict[Output, float]:
+    def log_moduli(point: np.ndarray) -> dict[Output, float]:
         law = structured_law(family.law_spec(family.bounded(point)), dt)
         moduli = {("elasticity", 0): law.elasticity.lam + 2 * law.elasticity.mu / 3}
         moduli["elasticity", 1] = law.elasticity.mu
@@ -233,16 +233,11 @@ def _log_moduli(fit: Mapping[str, Any], dt: float, model_std: float) -> tuple[li
             moduli |= {("plasticity", k): value for k, value in enumerate(constants) if value > 0}
         return {output: float(np.log(value)) for output, value in moduli.items()}
 
-    outputs = list(logs(u))
-    slope = np.stack(
-        [
-            [
-                (up - down) / (2 * _DIFFERENCE)
-                for up, down in zip(logs(u + step).values(), logs(u - step).values(), strict=True)
-            ]
-            for step in _DIFFERENCE * np.eye(len(u))
-        ],
-        axis=1,
-    )
+    def difference(step: np.ndarray) -> np.ndarray:
+        up, down = (np.array(list(log_moduli(u + s).values())) for s in (step, -step))
+        return (up - down) / (2 * _DIFFERENCE)
+
+    outputs = list(log_moduli(u))
+    slope = np.stack([difference(step) for step in _DIFFERENCE * np.eye(len(u))], axis=1)
     covariance = slope @ np.array(fit["unbounded"]["covariance"]) @ slope.T
     return outputs, covariance + model_std**2 * np.eye(len(outputs))

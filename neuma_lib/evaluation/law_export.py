@@ -12,7 +12,7 @@ import torch
 
 from neuma_lib.errors import InputError
 from neuma_lib.evaluation.material_point import Visited, largest_shear_stress
-from neuma_lib.evaluation.stress import STRAINED
+from neuma_lib.evaluation.stress import deformed_frames
 from neuma_lib.extras import require
 from neuma_lib.io.exported import about_law, read_about
 from neuma_lib.io.files import read_json
@@ -86,27 +86,25 @@ def visited_by(law: Law, F: torch.Tensor) -> dict[str, Any] | None:
     Returns:
         ``stretch``, ``shear``, ``pressed`` (`Visited`) and ``shear_stress``, the largest [Pa]. None if undeformed.
     """
-    deformed = (F - torch.eye(3, dtype=F.dtype)).abs().flatten(1).amax(1) > STRAINED
+    deformed = deformed_frames(F)
     if not deformed.any():
         return None
     F = F[int(deformed.int().argmax()) :].reshape(-1, 3, 3)
-    seen = Visited.of(F)
-    return {**vars(seen), "shear_stress": largest_shear_stress(law, F)}
+    return {**vars(Visited.of(F)), "shear_stress": largest_shear_stress(law, F)}
 
 
 def head_commit(root: str | Path) -> str | None:
     """The commit of a project, followed by "+" if files differ from it. None without git."""
-    commands = ["rev-parse", "HEAD"], ["status", "--porcelain", "--untracked-files=no"]
+
+    def git(*words: str) -> str:
+        command = ["git", "-C", root, *words]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
     try:
-        commit, changes = (
-            subprocess.run(
-                ["git", "-C", root, *words], capture_output=True, text=True, check=True
-            ).stdout.strip()
-            for words in commands
-        )
+        changes = git("status", "--porcelain", "--untracked-files=no")
+        return git("rev-parse", "HEAD") + ("+" if changes else "")
     except (OSError, subprocess.CalledProcessError):
         return None
-    return commit + ("+" if changes else "")
 
 
 def _numbers(metrics: Any) -> dict[str, Any] | None:

@@ -82,7 +82,7 @@ def visit(
     with torch.no_grad():
         motion = rollout(model, law, start, steps=frames[-1], frames=range(frames[-1] + 1)).cpu()
     F, C = motion.F, motion.C
-    deformed = (F - torch.eye(3, dtype=F.dtype)).abs().amax(dim=(1, 2, 3)) > STRAINED
+    deformed = deformed_frames(F)
     if not deformed[[n for n in frames if n > 0]].any():
         problem = f"no particle is deformed up to step {frames[-1]}, so there are no stresses to compare"
         raise InputError("frames", problem, "Extend the video until after the first contact")
@@ -94,6 +94,11 @@ def visit(
     points = volumes.multinomial(min(paths, len(volumes)), generator=generator)
     before = F[n - 1, p]
     return VisitedStates(F[n, p], before + model.dt * (C[n, p] @ before), C[:, points], tuple(after.tolist()))
+
+
+def deformed_frames(F: Tensor) -> Tensor:
+    """Frames (T,) in which a body with elastic deformation gradients F (T, N, 3, 3) is deformed by `STRAINED`."""
+    return (F - torch.eye(3, dtype=F.dtype)).abs().amax(dim=(1, 2, 3)) > STRAINED
 
 
 def stress_errors(law: Law, truth: Law, visited: VisitedStates, dt: float) -> dict[str, float | int | None]:

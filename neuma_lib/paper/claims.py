@@ -7,7 +7,6 @@ measures all motion and has no sampling floor. The paper gives Chamfer distances
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
@@ -151,18 +150,7 @@ class Verdict:
 
 
 @dataclass(frozen=True)
-class Claim(ABC):
-    """A statement about methods. Subclasses define the check."""
-
-    text: str
-
-    @abstractmethod
-    def holds(self, frame: Frame) -> Verdict | None:
-        """The verdict. None if the frame lacks a row or column."""
-
-
-@dataclass(frozen=True)
-class Closer(Claim):
+class Closer:
     """Some methods are closer to the truth than others, by `RULE`.
 
     For three replicates of equal spread, no overlap of the intervals means t > 2.4, which occurs by chance in 4 of 100
@@ -170,11 +158,13 @@ class Closer(Claim):
     "closer", since a difference that is not seen may still exist.
 
     Attributes:
+        text: the claim.
         better, worse: methods. The worst of the first is compared with the best of the second.
         columns: scenes or experiments; all columns if empty.
         by_paper: whether the paper makes the comparison.
     """
 
+    text: str
     better: tuple[str, ...]
     worse: tuple[str, ...]
     columns: tuple[str, ...] = ()
@@ -226,13 +216,14 @@ class Closer(Claim):
 
 
 @dataclass(frozen=True)
-class Bound(Claim):
+class Bound:
     """A bound on the error of a method.
 
     The claim *holds* if means plus standard deviations over at least `MIN_REPLICATES` replicates are within the bound,
     and no prediction of the method stopped early. It is *mixed* if the means alone are, else it *does not hold*.
 
     Attributes:
+        text: the claim.
         method: whose error is bounded.
         limit: the bound in the unit of the quantity, or in multiples of the error of the method ``of``.
         of: the method to compare with in the same column; none if empty.
@@ -241,6 +232,7 @@ class Bound(Claim):
         quantity: quantity that is bounded.
     """
 
+    text: str
     method: str
     limit: float
     of: str = ""
@@ -272,6 +264,10 @@ class Bound(Claim):
         here += f", kept in {within[:-1].sum()} of {len(columns)}" if self.count is not None else ""
         word = FAILS if not met else MIXED if reasons else HOLDS
         return Verdict(self.text, word, "; ".join([here, *reasons]) if word == MIXED else here)
+
+
+Claim = Closer | Bound
+"""Claims that a frame of errors is checked with. ``holds`` returns None if the frame lacks a row or column."""
 
 
 def counted(

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from neuma_lib.errors import InputError, NonFiniteError
@@ -102,10 +103,7 @@ def _check_steps(laws: Sequence[Law], dts: Sequence[float]) -> None:
 
 def tilted(about_x: float, about_z: float) -> np.ndarray:
     """Rotation (3, 3) of a box with its floor tilted about the axes x and z [degrees]."""
-    a, b = np.radians([about_x, about_z])
-    x = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
-    z = np.array([[np.cos(b), -np.sin(b), 0], [np.sin(b), np.cos(b), 0], [0, 0, 1]])
-    return z @ x
+    return Rotation.from_euler("xz", [about_x, about_z], degrees=True).as_matrix()
 
 
 def _queued(command: Callable[..., None]) -> Callable[..., None]:
@@ -133,6 +131,7 @@ class LiveSimulation:
 
     Attributes:
         floor: rotation (3, 3) of the box.
+        snapshot: the last one.
     """
 
     def __init__(self, constants: Mapping[str, Any], start: State, law: Law, dt: float):
@@ -161,16 +160,11 @@ class LiveSimulation:
         self._commands.put(lambda: None)
         self._thread.join(timeout=10)
 
-    @property
-    def snapshot(self) -> Snapshot:
-        """The last snapshot."""
-        return self._snapshot
-
     def wait(self, number: int, timeout: float = 10.0) -> Snapshot:
         """Wait for a snapshot with at least this number, or return the last one after a timeout [s]."""
         with self._news:
-            self._news.wait_for(lambda: self._snapshot.number >= number, timeout)
-            return self._snapshot
+            self._news.wait_for(lambda: self.snapshot.number >= number, timeout)
+            return self.snapshot
 
     def do(self, timeout: float = 10.0) -> Snapshot:
         """Wait until all previous commands are executed, and return the next snapshot."""
@@ -179,7 +173,7 @@ class LiveSimulation:
         try:
             return self.wait(reached.get(timeout=timeout), timeout)
         except queue.Empty:
-            return self._snapshot
+            return self.snapshot
 
     @_queued
     def reset(self) -> None:
@@ -361,7 +355,7 @@ class LiveSimulation:
         )  # fmt: skip
         self._number += 1
         with self._news:
-            self._snapshot = snapshot
+            self.snapshot = snapshot
             self._news.notify_all()
 
     def _restart(self) -> None:

@@ -48,14 +48,11 @@ class Blob:
     def frames(self, values: np.ndarray, bits: int = 16, ends: tuple[float, float] | None = None) -> dict:
         """Append values (T, C, M), quantised in the range of each component or in the given one; returns metadata."""
         T, C, M = values.shape
-        if ends is None:
-            low, high = values.min(axis=(0, 2)), values.max(axis=(0, 2))
-        else:
-            low, high = np.full(C, ends[0]), np.full(C, ends[1])
-        whole = quantised(values, low, high, bits)
-        start = self.add(as_differences(whole, bits))
-        ends = {"low": low.tolist(), "high": high.tolist()}
-        return {"start": start, "frames": T, "components": C, "count": M, "bits": bits, **ends}
+        low, high = ends or (values.min(axis=(0, 2)), values.max(axis=(0, 2)))
+        low, high = np.broadcast_to(low, C), np.broadcast_to(high, C)
+        start = self.add(as_differences(quantised(values, low, high, bits), bits))
+        span = {"low": low.tolist(), "high": high.tolist()}
+        return {"start": start, "frames": T, "components": C, "count": M, "bits": bits, **span}
 
 
 def quantised(values: np.ndarray, low: np.ndarray, high: np.ndarray, bits: int) -> np.ndarray:

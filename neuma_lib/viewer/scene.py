@@ -99,14 +99,6 @@ class Scene:
         """Steps of the frames on the slider: those of the motion with most frames."""
         return max((motion.steps for motion in self.motions), key=len)
 
-    def motion(self, name: str) -> Motion:
-        """The motion with a name. Raises InputError if there is none."""
-        for motion in self.motions:
-            if motion.name == name:
-                return motion
-        known = ", ".join(motion.name for motion in self.motions)
-        raise InputError(self.name, f"has no motion '{name}', only {known}")
-
 
 def frame_at(steps: tuple[int, ...], step: int) -> int:
     """Index of the last frame at or before a step, or of the first frame."""
@@ -128,10 +120,10 @@ def load_scene(
             (`SceneFiles.checked`).
     """
     paths = [files.checked(path) for path in (files.particles, files.binding, files.gaussians)]
-    body = load_reconstruction(*paths, files.density)
+    body, dt = load_reconstruction(*paths, files.density), files.simulation["dt"]
     motions, notes = [], []
     if files.truth:
-        motions.append(true_motion(files.checked(files.truth), body, files.simulation["dt"]))
+        motions.append(true_motion(files.checked(files.truth), body, dt))
     for run in files.runs:
         log(f"{run.title}: {run.rollout}")
         try:
@@ -149,18 +141,8 @@ def load_scene(
             views = load_views(files, side)
         except InputError as error:
             notes.append(f"no cameras: {one_line(error)}")
-    bounds = scalars.ranges(motion.scalars for motion in motions)
-    volume = float(body.vol0.sum())
-    return Scene(
-        files.name,
-        files.simulation["dt"],
-        body.gaussians,
-        volume,
-        tuple(motions),
-        views,
-        bounds,
-        tuple(notes),
-    )
+    bounds, volume = scalars.ranges(motion.scalars for motion in motions), float(body.vol0.sum())
+    return Scene(files.name, dt, body.gaussians, volume, tuple(motions), views, bounds, tuple(notes))
 
 
 def true_motion(path: Path, body: Reconstruction, dt: float) -> Motion:

@@ -172,25 +172,22 @@ class ViewerServer:
             add["add"] = gui.add_button("Drop it on top")
             add["flow"] = gui.add_checkbox("flow stretches Gaussians", False)
         value = lambda name: add[name].value  # noqa: E731
-        reactions = {
+        actions = {
             "running": lambda: simulation.run(value("running") and value("mode") == LIVE),
             "weight": lambda: simulation.set_weight(value("weight")),
             "gravity": lambda: simulation.set_gravity(value("gravity")),
             "tilt x": lambda: simulation.set_floor(value("tilt x"), value("tilt z")),
             "tilt z": lambda: simulation.set_floor(value("tilt x"), value("tilt z")),
-        }
-        presses = {
             "reset": play.reset,
             "drop": lambda: simulation.drop(value("height")),
             "launch": lambda: simulation.launch(value("velocity")),
             "add": lambda: play.add(value("shape")),
         }
-        for name, act in reactions.items():
-            add[name].on_update(lambda event, act=act: self._act(act))
+        for name, act in actions.items():
+            listen = add[name].on_click if hasattr(add[name], "on_click") else add[name].on_update
+            listen(lambda event, act=act: self._act(act))
         # resetting the list after a rejected choice must not clear the message
         add["law"].on_update(lambda event: value("law") != play.chosen and self._act(self._choose))
-        for name, act in presses.items():
-            add[name].on_click(lambda event, act=act: self._act(act))
         x = simulation.snapshot.x
         radius = _HANDLE * float((x.amax(dim=0) - x.amin(dim=0)).max())
         self._handle = self.server.scene.add_mesh_trimesh(
@@ -275,8 +272,8 @@ class ViewerServer:
 
     def _draw_recorded(self) -> None:
         step = self.scene.steps[self.gui["frame"].value]
-        left = self._titled(self.gui["left"].value)
-        right = None if self.gui["right"].value == NOTHING else self._titled(self.gui["right"].value)
+        named = {motion.title: motion for motion in self.scene.motions}
+        left, right = (named.get(self.gui[side].value) for side in ("left", "right"))
         display = self.gui["show"].value
         text = [f"**{1e3 * self.scene.dt * step:.0f} ms**"]
         self._turn(np.eye(3))
@@ -316,12 +313,10 @@ class ViewerServer:
                 if display == DISTANCE:
                     text.append("choose a second motion with Gaussians to see the distance")
             return self._splats(side, motion.means[frame], motion.covars[frame], rgb, g.opacities)
-        if name not in motion.scalars:
+        known = motion.scalars.get(name)
+        if known is None:
             text.append(f"{motion.title}: {QUANTITIES[name].label} is not known")
-            values = None
-        else:
-            values = motion.scalars[name][frame]
-        self._points(side, motion.x[frame], values, name, self.scene.volume)
+        self._points(side, motion.x[frame], None if known is None else known[frame], name)
 
     def _draw_live(self) -> None:
         play = self.playground
@@ -340,7 +335,7 @@ class ViewerServer:
                 self._hide_legend()
                 self._splats("left", picture.means, picture.covars, rgb, picture.gaussians.opacities)
             else:
-                self._points("left", snapshot.x, play.values(snapshot, name), name, self.scene.volume)
+                self._points("left", snapshot.x, play.values(snapshot, name), name)
             self._handle.position = snapshot.x[: snapshot.counts[0]].mean(dim=0).numpy()
         now, trouble = time.perf_counter(), (snapshot.trouble, snapshot.notice, self._message)
         if now - self._text_time > _TEXT_TIME or trouble != self._trouble:
@@ -357,9 +352,6 @@ class ViewerServer:
         if message := self._message or snapshot.notice:
             lines.append(f"*{message}*")
         return "  \n".join(lines)
-
-    def _titled(self, title: str) -> Motion:
-        return next(motion for motion in self.scene.motions if motion.title == title)
 
     def _largest_gap(self, a: Motion, b: Motion) -> float:
         """99th percentile of the distances between Gaussians in all frames, rounded up [m]."""
@@ -385,24 +377,20 @@ class ViewerServer:
             node.set_gaussians(*given)
         self._only(side, "splats")
 
-    def _points(self, side: str, x: torch.Tensor, values, name: str, volume: float) -> None:
+    def _points(self, side: str, x: torch.Tensor, values: torch.Tensor | None, name: str) -> None:
         quantity = QUANTITIES[name]
         low, high = self.scene.ranges.get(name, (0.0, quantity.min_range))
         rgb = np.full((len(x), 3), 0.7)
         if values is not None:
             rgb = colours(COLOURS[quantity.middle], ((values - low) / (high - low)).numpy())
         self._show_legend(COLOURS[quantity.middle], quantity.label, low, high, quantity.unit)
-        size = (volume / len(x)) ** (1 / 3)
+        size = (self.scene.volume / len(x)) ** (1 / 3)
         bytes_ = (255 * rgb).astype(np.uint8)
         node = self._nodes.get((side, "points"))
         if node is None or len(node.points) != len(x):
+            look = {"point_size": size, "point_shape": "circle", "precision": "float32"}
             self._nodes[side, "points"] = self.server.scene.add_point_cloud(
-                f"/{side}/box/points",
-                x.numpy(),
-                bytes_,
-                point_size=size,
-                point_shape="circle",
-                precision="float32",
+                f"/{side}/box/points", x.numpy(), bytes_, **look
             )
         else:
             node.points, node.colors = x.numpy(), bytes_

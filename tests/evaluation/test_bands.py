@@ -58,7 +58,7 @@ def binomial_bounds(trials):
     return COVERED * trials - 3.3 * std, COVERED * trials + 3.3 * std
 
 
-def test_fields_cover_truths_of_their_model():
+def test_random_fields_cover_truths_of_their_model():
     """Truths from the prior, observed with noise at some states: at new states, seen or silent, 95 % are inside."""
     generator = np.random.default_rng(0)
     prior, noise, trials, covered = np.array([0.5, 0.5, 0.5, 2.0]), 0.3, 400, np.zeros(2)
@@ -79,7 +79,7 @@ def test_fields_cover_truths_of_their_model():
     assert ((low <= covered) & (covered <= min(high, trials))).all(), covered / trials
 
 
-def test_constant_changes_are_known_as_well_as_the_video_determines():
+def test_constant_deviations_have_the_covariance_of_the_video():
     """With a free bias and no other feature the posterior is the covariance of the constants."""
     covariance = np.array([[0.04, 0.03], [0.03, 0.09]])
     posterior = field_covariance(np.ones((50, 1)), np.linalg.inv(covariance), np.array([1e6]))
@@ -106,8 +106,8 @@ def test_constants_cover_truths_around_their_estimates():
 # ---- laws
 
 
-def test_constants_that_go_together_stay_together():
-    """A flow stress that is known, of a stiffness that is not: log yield is fixed, log E is free."""
+def test_samples_of_constants_keep_correlations():
+    """A known flow stress with an unknown stiffness."""
     covariance = np.diag([0.25, 1e-8, 1e-8])
     laws = constants_draws(fit(covariance=covariance), 0.0, DT, 50, 0)
     E, flow = (
@@ -121,7 +121,7 @@ def test_constants_that_go_together_stay_together():
     )
 
 
-def test_families_that_tie_give_equal_parts():
+def test_tied_families_have_equal_parts_of_the_samples():
     fitted = fit(ties=["other"])
     other = {"elasticity": {"name": "neo_hookean", "E": 1e5, "nu": 0.3}}
     fitted["families"]["other"] = fit(other)["best"]
@@ -151,7 +151,7 @@ def test_draws_around_a_correction_are_structured_and_centred():
     assert abs(ratios.mean()) < 3 * ratios.std() / len(laws) ** 0.5
 
 
-def test_bands_are_wide_where_the_video_is_silent():
+def test_bands_are_wide_in_states_without_data():
     covariance = 1e-3 * np.eye(3)
     shear = torch.tensor([0.1, 0.6], dtype=torch.float64)  # as the most strained states, and far beyond
     seen, silent = log_spread(corrected(covariance, size=0.02), lambda law: sheared(law, shear))
@@ -166,7 +166,7 @@ def test_bands_are_wide_where_the_video_is_silent():
     assert (blind > 0.4).all()
 
 
-def test_deviations_vary_over_strains_as_the_networks_of_a_correction_do():
+def test_deviations_have_the_correlation_length_of_networks():
     """Correlation of the features of untrained networks at states that are LENGTH apart, their mean left out."""
     generator, result = torch.Generator().manual_seed(0), []
     last = 1e-3 * torch.eye(WIDTH, WIDTH + 1)  # gives the features themselves
@@ -182,7 +182,7 @@ def test_deviations_vary_over_strains_as_the_networks_of_a_correction_do():
     assert np.mean(result) == pytest.approx(np.exp(-0.5), abs=0.05)
 
 
-def test_what_is_known_together_stays_known_together():
+def test_corrected_draws_keep_correlations_of_constants():
     """Stiffness unknown and flow stress known: the band of the plateau is narrow, that of the slope is not."""
     family = Family("x", MISES)
     covariance = np.diag([0.2, 1e-6, 1e-6])
@@ -199,7 +199,7 @@ def test_what_is_known_together_stays_known_together():
     assert plateau < 0.6 * slope
 
 
-def test_an_envelope_holds_all_replicates():
+def test_envelope_contains_all_replicates():
     low, high = envelope([(np.array([0.0, 2]), np.array([1.0, 3])), (np.array([1.0, 1]), np.array([2.0, 2]))])
     assert low.tolist() == [0, 1] and high.tolist() == [2, 3]
 
@@ -231,7 +231,7 @@ def test_responses_of_all_kinds_of_laws_have_bands(part):
     assert "band" not in alone
 
 
-def test_inside_counts_visited_points_alone():
+def test_inside_counts_visited_points_only():
     results = {"x": [0, 1, 2, 3], "true": [0, 1, 2, 3], "visited": [0.5, 2.5], "by_stress": False}
     results["band"] = {"x": [0, 1, 2, 3], "low": [9, 0, 3, 9], "high": [9, 2, 4, 9]}
     assert inside(results) == 0.5

@@ -1,4 +1,4 @@
-"""Predicting a motion and comparing it with the truth: known errors are measured."""
+"""Evaluation of predicted motions with known errors."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def true_tracers(body, frames, *starts, law=LAW) -> list[torch.Tensor]:
     return path.tracers.split([len(points) for points in starts], dim=1)
 
 
-def test_the_true_law_from_another_sampling_is_as_good_as_the_sampling_allows():
+def test_error_of_the_true_law_on_other_particles_is_that_of_sampling():
     particles, tracers, frames = 1500, 500, [0, 20, 50, 75, 100]
     truth, again = true_tracers(
         ball(count=particles, seed=0), frames, in_ball(tracers, 10), in_ball(tracers, 11)
@@ -71,7 +71,7 @@ def test_the_true_law_from_another_sampling_is_as_good_as_the_sampling_allows():
 
 
 def test_a_known_shift_of_the_truth_is_the_error():
-    """Tracers on a lattice wider than twice the shift: every one has its own twin for a neighbour."""
+    """Tracers on a lattice wider than twice the shift, so that nearest neighbours are the same tracers."""
     shift = torch.tensor([3e-3, 0.0, 4e-3], dtype=torch.float64)  # 5 mm
     axis = 0.03 * torch.arange(-2, 3, dtype=torch.float64)
     lattice = torch.cartesian_prod(axis, axis, axis) + torch.tensor([0.5, 0.3, 0.5], dtype=torch.float64)
@@ -101,7 +101,7 @@ def test_a_known_shift_of_the_truth_is_the_error():
 
 
 class FailsOnce(Elasticity):
-    """The true elasticity, not a number at one evaluation of its life; a simulation evaluates it once a step."""
+    """The true elasticity, except for NaN at one evaluation. A simulation evaluates it once a step."""
 
     def __init__(self, step: int):
         super().__init__()
@@ -116,7 +116,7 @@ ON_THE_FLOOR = RADIUS + MODEL.free_range[0] - MODEL.dx / 2
 """Height at which particles of the ball feel the floor from the first step on."""
 
 
-def test_a_motion_that_diverges_is_held_and_marked():
+def test_a_diverging_motion_keeps_its_last_finite_frame():
     frames, body = [0, 4, 8, 12], ball(height=ON_THE_FLOOR)
     tracers = in_ball(50, 0, ON_THE_FLOOR)
     (truth,) = true_tracers(body, frames, tracers)
@@ -141,13 +141,13 @@ def test_a_motion_that_diverges_is_held_and_marked():
 
 
 class Repelling(Elasticity):
-    """The true elasticity with its sign turned: what is deformed is driven further."""
+    """The true elasticity with the opposite sign, which increases deformations."""
 
     def response(self, F, weights):
         return -LAW.elasticity.response(F, weights)
 
 
-def test_a_motion_that_explodes_had_too_much_energy_before():
+def test_an_unstable_motion_gains_energy_before_it_fails():
     """The kind of failure is read from the first invalid number, the energy from a frame before it."""
     frames, body = list(range(0, 61, 2)), ball(height=ON_THE_FLOOR)
     tracers = in_ball(50, 0, ON_THE_FLOOR)

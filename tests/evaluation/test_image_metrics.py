@@ -1,4 +1,4 @@
-"""Image measures: where they are taken, LPIPS against the authors' package, and weights that cannot run code."""
+"""Image measures: their window, LPIPS compared with the authors' package, and weights read without running code."""
 
 from __future__ import annotations
 
@@ -101,6 +101,8 @@ def test_measures_are_those_of_scikit_image_inside_the_window():
         use_sample_covariance=False,
     )
     assert metrics["ssim"] == pytest.approx(expected)
+    same = image_metrics(image, alpha, image, mask, {}, margin=0.1)
+    assert same["psnr"] == float("inf") and same["ssim"] == pytest.approx(1.0)
     # Nothing outside the window counts.
     image[:14], alpha[:14] = 0.0, 0.0
     assert image_metrics(image, alpha, reference, mask, {}, margin=0.1) == metrics
@@ -131,7 +133,7 @@ def plainly(weights: dict[str, torch.Tensor], net: str, a: torch.Tensor, b: torc
 
 
 @pytest.mark.parametrize("net", ["alex", "vgg"])
-def test_the_network_is_the_one_written_out(net):
+def test_lpips_equals_its_explicit_computation(net):
     weights = random_weights(net)
     network = LPIPS(weights, net)
     shapes = {"alex": [15, 7, 3, 3, 3], "vgg": [64, 32, 16, 8, 4]}[net]
@@ -175,7 +177,7 @@ def test_unusable_images_and_weights_are_named():
 
 
 class Harmful:
-    """Unpickled by pickle.load, this would make a folder."""
+    """pickle.load of this object would create a folder."""
 
     def __init__(self, path):
         self.path = path
@@ -218,7 +220,7 @@ def test_weights_are_converted(tmp_path):
 
 
 @pytest.mark.parametrize("protocol", [0, 2, 4, 5])
-def test_a_pickle_that_asks_for_code_is_refused(tmp_path, protocol):
+def test_a_pickle_with_code_is_refused(tmp_path, protocol):
     content = pickle.dumps({"AlexNet_0": Harmful(tmp_path / "made")}, protocol)
     with pytest.raises(InputError, match="mkdir is refused"):
         read_plain_pickle(content, "weights")

@@ -1,4 +1,4 @@
-"""Laws to pass on: files that are complete, the time step that belongs to a law, released adaptors, numpy alone."""
+"""Exported laws: complete files, time steps, released adaptors, and evaluation with numpy alone."""
 
 import json
 import shutil
@@ -57,7 +57,7 @@ def analytic(plastic="von_mises", elastic=HENCKY, dt=DT):
 
 
 def networks(seed=0, size=30.0):
-    """Random networks whose stresses are those of a soft solid, with a trained adaptor."""
+    """Random networks with stresses of a soft solid and a trained adaptor."""
     law = neural_law(seed=seed)
     for weight in law.elasticity.base:
         weight.data *= size ** (1 if weight.shape[0] == 9 else 0.5)
@@ -95,7 +95,7 @@ LAWS = {
 
 
 @pytest.mark.parametrize("make", LAWS.values(), ids=LAWS)
-def test_a_law_comes_back_from_one_file(tmp_path, make):
+def test_a_law_is_written_and_read(tmp_path, make):
     law, path = make(), tmp_path / "law.safetensors"
     save_law(path, law, about_law(law, DT, scene="Cat", density=800.0))
     same(load_law(path), law)
@@ -111,7 +111,7 @@ def test_a_law_comes_back_from_one_file(tmp_path, make):
 
 
 @pytest.mark.parametrize("make", [networks, structured])
-def test_prior_and_adaptor_apart_keep_their_weight(tmp_path, make):
+def test_separate_adaptor_keeps_its_weight(tmp_path, make):
     law, path = make(), tmp_path / "law.safetensors"
     save_law(path, law, about_law(law, DT), separate_adaptor=True)
     again = load_law(path)
@@ -123,8 +123,8 @@ def test_prior_and_adaptor_apart_keep_their_weight(tmp_path, make):
     same(load_law(path), law, rel=1e-6)
 
 
-def test_as_a_prior_an_adaptor_apart_is_merged(tmp_path):
-    """Else a training, which attaches a new one, would forget it."""
+def test_separate_adaptor_is_merged_into_a_prior(tmp_path):
+    """Otherwise a training, which attaches a new adaptor, would lose it."""
     law, path = networks(), tmp_path / "law.safetensors"
     save_law(path, law, about_law(law, DT), separate_adaptor=True)
     prior = load_adaptable(path, DT)
@@ -132,7 +132,7 @@ def test_as_a_prior_an_adaptor_apart_is_merged(tmp_path):
     same(prior, law, rel=1e-6)
 
 
-def test_the_adaptor_of_a_structured_law_is_a_whole_law(tmp_path):
+def test_adaptor_file_of_a_structured_law_is_complete(tmp_path):
     law, path = structured(), tmp_path / "adaptor.safetensors"
     save_adaptor(path, law, None, 16.0, {})
     for load in (load_law, load_prior):
@@ -153,9 +153,9 @@ def returned(law, F):
 
 
 @pytest.mark.parametrize("plastic", PLASTICITIES)
-def test_analytic_returns_know_their_step(plastic):
-    """One that is called independent of the step projects: returning twice is returning once. One that follows the step
-    lets go as much in two halves of it as at once, to second order in the step."""
+def test_step_dependence_of_analytic_return_maps(plastic):
+    """A map that does not depend on the step is a projection. For another map, two half steps equal a whole step, to
+    second order in the step."""
     F = deformations(size=0.02).double()
     law = analytic(plastic)
     if plastic not in FOLLOWING:
@@ -175,7 +175,7 @@ def test_analytic_returns_know_their_step(plastic):
     assert less_flow == pytest.approx(flow / 2, rel=0.2) and less_gap < 0.35 * gap  # 1/4 in the limit
 
 
-def test_a_network_is_fixed_to_its_step():
+def test_step_dependence_of_networks():
     assert step_dependence(networks()) == "fixed"
     assert step_dependence(structured()) == "fixed"
     assert step_dependence(structured(parts=("elasticity",))) == "none"  # its return is von Mises'
@@ -199,7 +199,7 @@ def test_another_step_is_refused(tmp_path, make, load):
 
 
 @pytest.mark.parametrize("make", [networks, structured])
-def test_another_step_can_be_asked_for(tmp_path, make):
+def test_another_step_can_be_allowed(tmp_path, make):
     law, path = make(), tmp_path / "law.safetensors"
     save_law(path, law, about_law(law, DT))
     same(load_law(path, dt=2 * DT, any_time_step=True), law)
@@ -209,7 +209,7 @@ def test_another_step_can_be_asked_for(tmp_path, make):
 
 
 @pytest.mark.parametrize("make", [analytic, lambda *a: structured(*a, parts=("elasticity",))])
-def test_laws_that_know_their_step_follow(tmp_path, make):
+def test_laws_that_depend_on_the_step_are_adapted_to_it(tmp_path, make):
     path = tmp_path / "law.safetensors"
     for plastic, changes in {"von_mises": False, "viscous_flow": True}.items():
         law = make(plastic)
@@ -224,7 +224,7 @@ def test_laws_that_know_their_step_follow(tmp_path, make):
 
 
 def released(tmp_path, seed=0, rank=16):
-    """A prior and an adaptor in the layout of the authors' files, and the merged weights that they mean."""
+    """Write a prior and an adaptor in the layout of the authors' files, and return the merged weights."""
     generator = torch.Generator().manual_seed(seed)
     prior, lora = {}, {}
     merged = {}
@@ -243,7 +243,7 @@ def released(tmp_path, seed=0, rank=16):
 
 
 @pytest.mark.parametrize("rank", [16, 4])
-def test_released_adaptors_mean_the_unscaled_merge(tmp_path, rank):
+def test_released_adaptors_are_merged_without_scale(tmp_path, rank):
     merged = released(tmp_path, rank=rank)
     law = load_law(tmp_path / "jelly_0300.pt", tmp_path / "1000_lora.pt")
     for kind, part in (NeuralElasticity, "elasticity"), (NeuralPlasticity, "plasticity"):
@@ -275,7 +275,7 @@ DAMAGES = {
 
 
 @pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
-def test_other_files_are_no_released_adaptors(tmp_path, damage):
+def test_damaged_released_adaptors_are_refused(tmp_path, damage):
     released(tmp_path)
     lora = torch.load(tmp_path / "1000_lora.pt", weights_only=True)
     damage(lora)
@@ -296,7 +296,7 @@ METADATA = {
 
 
 @pytest.mark.parametrize("about", METADATA.values(), ids=METADATA)
-def test_metadata_that_cannot_be_meant(tmp_path, about):
+def test_invalid_metadata_is_refused(tmp_path, about):
     path = tmp_path / "law.safetensors"
     write_weights(path, neural_law().prior_state(), {EXPORT: about})
     for read in (read_about, load_law, load_prior):
@@ -319,7 +319,7 @@ def test_analytic_files_are_checked(tmp_path):
         load_adaptable(path)
 
 
-def test_nothing_is_written_where_something_is_wrong(tmp_path, capsys):
+def test_a_failed_export_writes_nothing(tmp_path, capsys):
     law, bare = tmp_path / "law.safetensors", neural_law()
     save_law(law, bare, about_law(bare, DT))
     (tmp_path / "folder").mkdir()
@@ -394,7 +394,7 @@ def test_constants_are_exported_with_their_step(project):
     assert about["kind"] == "analytic" and about["prior"] is None and about["visited"] is None
 
 
-def test_a_law_cannot_be_that_of_springs_or_of_nobody(project, capsys):
+def test_folders_without_a_law_are_refused(project, capsys):
     for name, complaint in {"spring_gaus": "no material law", "neumaa": "no method 'neumaa'"}.items():
         (project / "results/ClayCat" / name).mkdir()
         assert (
@@ -421,7 +421,7 @@ sys.exit(f"imported {{foreign}}" if foreign else 0)
 
 
 def in_numpy(folder, laws, module):
-    """Both parts of laws by an example, in a process that has numpy alone; F in float64."""
+    """Evaluate both parts of laws by an example, in a process without other packages; F in float64."""
     for k, law in enumerate(laws):
         save_law(folder / f"law{k}.safetensors", law, about_law(law, DT))
     F = deformations(size=0.15).double()
@@ -441,14 +441,14 @@ def assert_as_ours(law, F, result):
         assert moved > 1e-3 or isinstance(ours, PLASTICITIES["identity"])
 
 
-def test_numpy_alone_evaluates_networks(tmp_path):
+def test_numpy_example_evaluates_networks(tmp_path):
     law = networks()
     law.plasticity.base[-1].data *= 50
     F, (result,) = in_numpy(tmp_path, [law], "law_in_numpy")
     assert_as_ours(law, F, result)
 
 
-def test_numpy_alone_evaluates_every_law(tmp_path):
+def test_numpy_example_evaluates_every_law(tmp_path):
     laws = [
         make(plastic, {**HENCKY, "name": elastic})
         for make in (analytic, structured)
@@ -461,9 +461,9 @@ def test_numpy_alone_evaluates_every_law(tmp_path):
         assert_as_ours(law, F, result)
 
 
-def test_the_example_simulates_as_we_do(tmp_path, monkeypatch):
-    """A cube that swings in free air and falls, with the return map: the example's simulator against ours, in float64.
-    Both see the law's float32 weights; ours adds and multiplies in another order."""
+def test_numpy_example_simulates_as_the_library(tmp_path, monkeypatch):
+    """An oscillating and falling cube with a return map, in float64 with the law's float32 weights. The order of
+    floating point operations differs."""
     monkeypatch.syspath_prepend(str(ROOT / "examples"))
     import isotropic_in_numpy
     import mpm_in_numpy
@@ -494,7 +494,7 @@ def test_the_example_runs_from_the_command_line(tmp_path):
     assert printed.startswith("0.00 s: lowest 0.2") and "0.28 s" in printed
 
 
-def test_foreign_safetensors_are_no_laws(tmp_path):
+def test_other_safetensors_are_refused(tmp_path):
     save_file({"x": torch.zeros(2)}, tmp_path / "x.safetensors")
     with refused("x.safetensors"):
         read_about(tmp_path / "x.safetensors")

@@ -1,4 +1,4 @@
-"""Figures: every one draws from its data in print quality; particles, crops and tests of material points are right."""
+"""Figures are drawn from their data in print quality. Particles, crops and tests of material points are correct."""
 
 from __future__ import annotations
 
@@ -354,7 +354,7 @@ def test_responses_are_of_their_law_and_bands_of_all_replicates(tmp_path):
 # ---- style
 
 
-def test_one_look_a_method():
+def test_every_method_has_its_look():
     drawn = {name for name, preset in built_in_presets().items() if preset["same_fit_as"] is None}
     assert drawn <= set(style.METHODS)
     for part in ("color", "marker"):
@@ -380,7 +380,7 @@ PROTANOPIA = [
 @pytest.mark.parametrize(
     "eyes", [np.eye(3), DEUTERANOPIA, PROTANOPIA], ids=["all", "deuteranopia", "protanopia"]
 )
-def test_methods_look_different_to_all_eyes(eyes):
+def test_methods_differ_in_colour_for_any_colour_vision(eyes):
     from skimage.color import rgb2lab
 
     colours = {
@@ -401,33 +401,33 @@ def spheres(points, colors, radius=0.1):
     return draw_spheres(np.array(points, float), np.array(colors, float), radius, viewmat, K, 64, 48)
 
 
-def test_sphere_stands_where_and_as_large_as_projected():
+def test_sphere_has_projected_position_and_size():
     image = spheres([[0.1, -0.05, 1.0]], [0, 0, 0])
     rows, columns = np.nonzero((image < 128).all(-1))
     assert abs(columns.mean() + 0.5 - 42) < 0.3 and abs(rows.mean() + 0.5 - 19) < 0.3
     assert len(rows) == pytest.approx(np.pi * 10**2, rel=0.05)
 
 
-def test_near_spheres_hide_far_ones_whatever_the_order():
+def test_near_spheres_hide_far_ones_in_any_order():
     red, blue = [1.0, 0, 0], [0, 0, 1.0]
     for order in (1, -1):
         image = spheres([[0, 0, 1.0], [0, 0, 1.5]][::order], [red, blue][::order])
         assert image[24, 32, 0] > 60 and image[24, 32, 2] < 10
 
 
-def test_no_sphere_no_picture():
+def test_picture_without_visible_spheres_is_white():
     assert (spheres(np.zeros((0, 3)), [0, 0, 0]) == 255).all()
     assert (spheres([[0, 0, -1.0]], [0, 0, 0]) == 255).all()
 
 
-def test_magnified_cameras_see_the_same():
+def test_magnified_cameras_scale_projections():
     points = torch.tensor([[0.1, 0.2, 1.0], [-0.2, 0.1, 2.0]])
     large = magnified(CAMERA, 3)
     assert (large.width, large.height) == (192, 144)
     assert torch.allclose(large.project(points)[0], 3 * CAMERA.project(points)[0])
 
 
-def test_frontal_camera_sees_everything():
+def test_frontal_camera_sees_all_points():
     points = np.random.default_rng(0).uniform(0.2, 0.8, (50, 3))
     pixels, depth = frontal(points, 80, 60).project(torch.from_numpy(points).float())
     assert (
@@ -449,7 +449,7 @@ def test_crops_have_one_size_and_lose_nothing():
         assert (where[0] - where[0][0] == where[1] - where[1][0]).all()  # moved as a whole
 
 
-def test_row_titles_break_where_they_are_too_wide():
+def test_wide_row_titles_are_wrapped():
     title = "NeuMA, 1000 kg/m³ assumed\neverywhere"
     lines = broken(title, 1.0).split("\n")
     assert len(lines) > 2 and " ".join(lines).split() == title.split()
@@ -458,7 +458,7 @@ def test_row_titles_break_where_they_are_too_wide():
     assert broken("unbreakable", 0.1) == "unbreakable"
 
 
-def test_monotone_frames_are_counted_where_the_motions_part():
+def test_monotone_frames_are_counted_where_motions_differ():
     heights = [[1.0, 3.0, 1.0, 5.0], [1.0, 2.0, 2.0, 4.0], [1.0, 1.0, 1.5, 4.0]]
     assert monotone_frames(heights) == (2, 3)
     assert monotone_frames(heights[::-1]) == (2, 3)
@@ -469,7 +469,7 @@ def test_evenly_keeps_the_ends():
     assert evenly(5, 3) == [0, 1, 2]
 
 
-def test_pictures_and_titles_survive_the_disk(tmp_path):
+def test_image_grid_is_written_and_read(tmp_path):
     grid = pictures(2, 3, {"weights": [0.5], "name": "ΔM"})
     save_image_grid(tmp_path / "a.h5", grid)
     again = load_image_grid(tmp_path / "a.h5")

@@ -120,7 +120,7 @@ TABLES = {
 
 
 @pytest.mark.parametrize("name", TABLES)
-def test_texts_of_tables_stay_the_same(name):
+def test_tables_equal_golden_files(name):
     csv, markdown = TABLES[name]()
     assert markdown == (GOLDEN / f"{name}.md").read_text()
     assert csv == (GOLDEN / f"{name}.csv").read_text()

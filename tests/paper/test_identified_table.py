@@ -56,7 +56,7 @@ def test_the_family_is_scored_by_its_laws(truth, family, ties, verdict):
     assert compare_family(scene(truth, family, ties)["identified"], truth) == verdict
 
 
-def test_errors_are_those_of_the_truths_quantities():
+def test_errors_are_of_quantities_of_the_truth():
     scored = scene(HENCKY, "hencky", E=(1.1e5, 0.05, True), G=(3.6e4, 0.1, False), viscosity=(3.0, 0.1, True))
     young, shear = compare_quantities(scored["identified"], HENCKY)  # the truth has no viscosity
     assert young["error_percent"] == pytest.approx(10)
@@ -70,7 +70,7 @@ def test_errors_are_those_of_the_truths_quantities():
 
 
 @pytest.mark.parametrize("close, word", [(4, "holds"), (3, "does not hold")])
-def test_four_of_five_are_asked(close, word):
+def test_claims_need_four_of_five(close, word):
     values = [1e5] * close + [1.3e5] * (5 - close)
     scenes = [scene(HENCKY, "hencky", E=(value, 0.05, True)) for value in values]
     verdicts = identified_table(scenes)[1].partition("**What holds**")[2]
@@ -78,13 +78,6 @@ def test_four_of_five_are_asked(close, word):
     assert "**holds**" in families and "5 of 5" in families
     assert f"**{word}**" in coverage and f"{close} of 5" in coverage
     assert f"**{word}**" in error
-
-
-def test_groups_are_scored_separately():
-    scenes = [scene(HENCKY, "hencky", group="a"), scene(HENCKY, "neo_hookean", group="b")]
-    text = identified_table(scenes)[1]
-    assert "| a: the family is right" in text and "| b: the family is right" in text
-    assert "1 of 1" in text and "0 of 1" in text
 
 
 def test_nothing_identified_is_an_error():

@@ -1,4 +1,4 @@
-"""Pages get their numbers from recorded tables and figures, and nothing else of them changes."""
+"""Recording updates numbers of pages from tables and figures, and nothing else."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def recorded(project, monkeypatch, *options) -> tuple[str, str]:
     )
 
 
-def test_pages_are_filled_from_tables_and_figures(project, monkeypatch):
+def test_pages_are_updated_from_tables_and_figures(project, monkeypatch):
     readme, page = recorded(project, monkeypatch)
     assert readme.startswith("# Title\n\nBefore.\n") and readme.endswith("<!-- /table1 -->\n\nAfter.\n")
     assert "\nold\n" not in readme and "commit abc: [all columns" in readme and "*paper*" not in readme
@@ -135,13 +135,13 @@ def test_tables_that_are_not_recorded_are_named(project, monkeypatch):
     assert "older version, without verdicts: table2." in record.verdicts(whole | {"table2": "- Holds: ..."})
 
 
-def test_a_page_without_its_place_is_named(project, monkeypatch):
+def test_a_page_without_a_marker_is_refused(project, monkeypatch):
     (project / "README.md").write_text("nothing\n")
     with pytest.raises(SystemExit, match="0 places <!-- table1 -->"):
         recorded(project, monkeypatch)
 
 
-def test_the_pages_of_the_project_have_their_places():
+def test_pages_of_the_project_have_their_markers():
     pages = {
         "README.md": "table1",
         "docs/results/claims.md": "verdicts",

@@ -30,6 +30,10 @@ def scene(folder):
     return load_scene(find_scene(folder)[1])
 
 
+def motion_of(scene, name):
+    return next(motion for motion in scene.motions if motion.name == name)
+
+
 def stretched(a):
     """A stretch that keeps the volume, e^a along x, turned about z."""
     c, s = np.cos(0.7), np.sin(0.7)
@@ -37,7 +41,7 @@ def stretched(a):
     return turn @ torch.diag(torch.tensor([a, -a / 2, -a / 2], dtype=torch.float64).exp())
 
 
-def test_von_mises_stress_of_a_stretch_is_that_of_the_closed_form():
+def test_von_mises_stress_of_a_stretch_has_a_closed_form():
     """Hencky: s = 2 G dev log(stretch), so that sqrt(3/2 s : s) = 3 G a; pressure alone gives none."""
     law, (E, nu) = make_law("hencky"), (SPECS["hencky"]["elasticity"][key] for key in ("E", "nu"))
     G = E / (2 * (1 + nu))
@@ -47,7 +51,7 @@ def test_von_mises_stress_of_a_stretch_is_that_of_the_closed_form():
     assert torch.allclose(scalars.von_mises(law, 1.1 * F), wanted / 1.1**3, rtol=1e-9, atol=1e-7), "Cauchy's"
 
 
-def test_plastic_strain_is_what_flowed_and_nothing_for_an_elastic_body():
+def test_plastic_strain_is_zero_for_an_elastic_body():
     F, flowed = stretched(0.15)[None], stretched(0.3)[None]
     assert torch.allclose(scalars.plastic_strain(F, F @ flowed), flowed.new_tensor([0.3]))
     assert scalars.plastic_strain(F, F).abs().max() < 1e-12
@@ -70,7 +74,7 @@ def test_speed_of_a_uniform_motion_at_uneven_times():
     assert scalars.speed(x[:1], times[:1]).sum() == 0
 
 
-def test_legends_are_round_and_suit_the_motion_in_the_middle():
+def test_legend_ranges_are_round_and_of_the_median_motion():
     motions = [{"speed": torch.full((9,), value)} for value in (2.2, 2.3, 400.0)]
     motions[0]["volume_ratio"] = torch.tensor([0.93, 1.01])
     assert scalars.ranges(motions) == {"speed": (0.0, 3.0), "volume_ratio": pytest.approx((0.92, 1.08))}
@@ -84,11 +88,11 @@ def test_a_folder_gives_truth_and_methods_with_gaussians_that_follow(scene):
     wanted = 0.5 + (scene.gaussians.means - 0.5) @ STRETCH.T - torch.tensor([0.0, FALL, 0.0])
     A = STRETCH @ scene.gaussians.covars() @ STRETCH.T
     for name in ("truth", "constants"):  # both follow affine motions exactly
-        motion = scene.motion(name)
+        motion = motion_of(scene, name)
         assert torch.allclose(motion.means[-1], wanted, atol=2e-6)
         assert torch.allclose(motion.covars[-1], A, atol=1e-8)
         assert set(motion.scalars) == set(scalars.QUANTITIES)
-    true, result = (scene.motion(name).scalars for name in ("truth", "constants"))
+    true, result = (motion_of(scene, name).scalars for name in ("truth", "constants"))
     for name in ("von_mises", "volume_ratio"):  # the same law and deformation
         assert torch.allclose(true[name][-1].mean(), result[name][-1].mean(), rtol=1e-5)
     assert true["speed"].allclose(torch.tensor(3.0).sqrt()), "the stored velocities"
@@ -100,9 +104,9 @@ def test_a_law_of_another_time_step_is_shown_at_the_same_times(tmp_path, scene):
     arrays, attributes = read_arrays(place / "nclaw" / "rollout.h5", ("x", "F", "frames"))
     refined = {**arrays, "frames": 2 * arrays["frames"]}
     write_arrays(place / "nclaw" / "rollout.h5", refined, {"dt": attributes["dt"] / 2})
-    again = load_scene(find_scene(place)[1]).motion("nclaw")
-    assert again.steps == scene.motion("nclaw").steps
-    assert torch.allclose(again.scalars["speed"], scene.motion("nclaw").scalars["speed"])
+    again = motion_of(load_scene(find_scene(place)[1]), "nclaw")
+    assert again.steps == motion_of(scene, "nclaw").steps
+    assert torch.allclose(again.scalars["speed"], motion_of(scene, "nclaw").scalars["speed"])
 
 
 def test_cameras_have_their_images(scene):
@@ -161,7 +165,7 @@ def test_bad_folders_are_refused_with_a_remedy(folder, tmp_path):
 
 
 @pytest.mark.parametrize("bits", [8, 16])
-def test_frames_come_back_to_half_a_step(bits):
+def test_frames_are_decoded_to_half_a_quantisation_step(bits):
     """Decoded as page.js does it."""
     values = np.random.default_rng(0).normal(size=(5, 3, 40)).cumsum(axis=0)
     blob = Blob()
@@ -183,19 +187,19 @@ def decode(data, entry):
     return low + (high - low) * whole.reshape(T, entry["components"], -1) / (2 ** entry["bits"] - 1)
 
 
-def test_quantised_values_stay_between_the_ends():
+def test_quantised_values_are_clipped():
     ends = np.array([0.0]), np.array([2.0])
     assert quantised(np.array([[[-1.0, 0.0, 2.0, 9.0]]]), *ends, 8).tolist() == [[[0, 0, 255, 255]]]
 
 
-def test_roots_give_covariances_back(scene):
-    covars = scene.motion("truth").covars
+def test_roots_are_square_roots_of_covariances(scene):
+    covars = motion_of(scene, "truth").covars
     a, b, c, d, e, f = roots(covars).transpose(1, 0, 2)
     half = np.stack([[a, b, c], [b, d, e], [c, e, f]]).transpose(2, 3, 0, 1)
     assert np.allclose(half @ half, covars.numpy(), atol=1e-9)
 
 
-def test_the_file_holds_everything_and_is_the_same_twice(scene):
+def test_the_file_is_complete_and_reproducible(scene):
     text = page(scene)
     assert text == page(scene)
     meta = json.loads(re.search(r'id="meta">(.*?)</script>', text, re.S)[1])
@@ -210,7 +214,7 @@ def test_the_file_holds_everything_and_is_the_same_twice(scene):
     assert not re.search(r"(src|href)=|https?://|url\(|import\s*\(", text), "it loads nothing"
 
 
-def test_frames_are_left_out_of_a_file_that_would_be_too_large(scene):
+def test_frames_are_dropped_from_a_file_that_is_too_large(scene):
     whole = len(page(scene))
     smaller = page(scene, megabytes=0.95 * whole / 1e6)
     meta = json.loads(re.search(r'id="meta">(.*?)</script>', smaller, re.S)[1])
@@ -220,7 +224,7 @@ def test_frames_are_left_out_of_a_file_that_would_be_too_large(scene):
     assert len(page(scene, particles=100)) < whole
 
 
-def test_names_are_text_and_not_markup(scene):
+def test_names_are_escaped(scene):
     from dataclasses import replace
 
     text = page(replace(scene, name="</script><b>@DATA@", notes=("</script>",)))

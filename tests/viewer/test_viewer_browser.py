@@ -18,7 +18,7 @@ from tests.support.viewer_project import SCENE, STEPS, make_project, make_splat
 OF_VISER = "THREE.BufferGeometry.computeBoundingSphere(): Computed radius is NaN"
 """The message of viser's client 1.1.1 for every scene with splats, once: it draws them on quads whose corners have two
 coordinates, of which three.js wants the bounding sphere. Without a sphere it draws them always, as it should. Once
-`test_viser_alone_reports_it` fails, this exception can go."""
+`test_viser_reports_the_message_itself` fails, this exception can go."""
 
 
 @pytest.fixture(scope="module")
@@ -27,10 +27,27 @@ def folder(tmp_path_factory):
 
 
 def picture(page, selector="canvas"):
-    """What is on the screen, RGB."""
+    """Screenshot of an element, RGB."""
     page.wait_for_timeout(150)
     shot = page.locator(selector).first.screenshot()
     return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB")).astype(int)
+
+
+def first_picture(page):
+    """The picture of a file's page that is ready."""
+    page.wait_for_selector("body[data-state=ready]")
+    first = picture(page)
+    assert differ(first, np.full_like(first, 255)) > 0.02, "something is drawn"
+    return first
+
+
+def check_playback(page, first):
+    """Play the first frames slowly."""
+    page.select_option("#pace", "0.03125")
+    page.click("#play")
+    page.wait_for_selector("body[data-frame='2']", timeout=10_000)
+    page.click("#play")
+    assert differ(first, picture(page)) > 0.005, "it plays"
 
 
 def differ(a, b):
@@ -43,8 +60,7 @@ def test_the_file_opens_without_a_server_plays_and_follows_its_controls(folder, 
     with opened((tmp_path / "viewer.html").as_uri()) as (page, complaints):
         page.wait_for_selector("body[data-state=ready]")
         page.select_option("#right", "")  # one motion: the truth alone
-        first = picture(page)
-        assert differ(first, np.full_like(first, 255)) > 0.02, "something is drawn"
+        first = first_picture(page)
 
         def at(frame):
             page.evaluate(
@@ -57,13 +73,7 @@ def test_the_file_opens_without_a_server_plays_and_follows_its_controls(folder, 
         assert differ(first, last) > 0.01, "the slider moves pixels"
         assert differ(first, at(0)) == 0, "and back"
         assert page.inner_text("#clock") == "0 ms"
-
-        page.select_option("#pace", "0.03125")
-        page.click("#play")
-        page.wait_for_selector("body[data-frame='2']", timeout=10_000)
-        page.click("#play")
-        assert differ(first, picture(page)) > 0.005, "it plays"
-
+        check_playback(page, first)
         seen = at(0)
         pictures = {name: None for name in ("speed", "von_mises", "plastic_strain", "volume_ratio")}
         for name in pictures:
@@ -96,15 +106,8 @@ def test_the_file_of_a_splat_has_the_motion_of_its_law_alone_and_plays(tmp_path)
     assert scene.steps == tuple(2 * step for step in STEPS)  # its steps are half as long as those of the law
     write_page(tmp_path / "viewer.html", scene)
     with opened((tmp_path / "viewer.html").as_uri()) as (page, complaints):
-        page.wait_for_selector("body[data-state=ready]")
+        check_playback(page, first_picture(page))
         assert page.locator("#left option").all_inner_texts() == [scene.motions[0].title]
-        first = picture(page)
-        assert differ(first, np.full_like(first, 255)) > 0.02, "something is drawn"
-        page.select_option("#pace", "0.03125")
-        page.click("#play")
-        page.wait_for_selector("body[data-frame='2']", timeout=10_000)
-        page.click("#play")
-        assert differ(first, picture(page)) > 0.005, "it plays"
         page.select_option("#show", "von_mises")
         assert page.is_visible("#legend")
         assert not complaints
@@ -124,7 +127,7 @@ def served(folder):
 
 
 @pytest.mark.slow
-def test_the_server_plays_moves_and_simulates(served):
+def test_the_server_plays_and_simulates(served):
     assert served.host == "127.0.0.1", "this machine alone, by default"
     with opened(f"http://127.0.0.1:{served.port}", 800, 600) as (page, complaints):
         page.wait_for_selector("text=next to it", timeout=60_000)
@@ -175,8 +178,8 @@ def test_the_server_plays_moves_and_simulates(served):
 
 
 @pytest.mark.slow
-def test_viser_alone_reports_it():
-    """A Gaussian, and nothing of ours."""
+def test_viser_reports_the_message_itself():
+    """A scene of one Gaussian, without code of this project."""
     viser = pytest.importorskip("viser")
     server = viser.ViserServer(port=8470, verbose=False)
     one = np.ones((1, 3), np.float32)

@@ -1,4 +1,4 @@
-"""The live simulation: its thread obeys, resets after anything, and simulates what `rollout` does."""
+"""The live simulation executes commands, can always be reset, and equals `rollout`."""
 
 import time
 
@@ -40,7 +40,7 @@ def live():
 
 
 class Exploding(Elasticity):
-    """A stress that tears everything apart once it is deformed at all."""
+    """A stress that diverges at any deformation."""
 
     def response(self, F, weights):
         return 1e12 * (F + 0.1)
@@ -73,7 +73,7 @@ def test_it_simulates_what_a_rollout_does(live):
     assert (result.F - torch.eye(3)).abs().max() > 1e-3, "it has touched the floor"
 
 
-def test_a_tilted_floor_is_turned_gravity(live):
+def test_a_tilted_floor_rotates_gravity(live):
     simulation = live(height=0.5)
     simulation.set_floor(20.0, -10.0)
     simulation.reset()
@@ -93,7 +93,7 @@ def test_a_tilted_floor_is_turned_gravity(live):
     assert np.allclose(back, place)
 
 
-def test_a_law_that_diverges_is_reported_and_a_reset_helps(live):
+def test_a_diverging_law_is_reported_until_a_reset(live):
     simulation = live(height=0.14)
     simulation.set_law(exploding(), DT)
     result = reached(simulation, lambda s: s.trouble)
@@ -107,7 +107,7 @@ def test_a_law_that_diverges_is_reported_and_a_reset_helps(live):
     assert reached(simulation, lambda s: s.time > 0.05).trouble is None
 
 
-def test_an_error_in_foreign_code_ends_nothing(live):
+def test_an_error_of_a_law_does_not_end_the_thread(live):
     class Broken(Elasticity):
         def response(self, F, weights):
             raise RuntimeError("no such file")
@@ -134,7 +134,7 @@ def test_reset_restores_the_start_bit_by_bit(live):
     assert torch.equal(result.F, torch.eye(3).expand(200, 3, 3))
 
 
-def test_uneven_frames_do_not_make_the_numbers_on_the_screen_larger(monkeypatch):
+def test_rate_and_pace_are_not_biased_by_uneven_frames(monkeypatch):
     simulation = LiveSimulation(CONSTANTS, start(), make_law("hencky", torch.float32), DT)  # no thread
     clock = simulation._measured
     monkeypatch.setattr(time, "perf_counter", lambda: clock)
@@ -147,7 +147,7 @@ def test_uneven_frames_do_not_make_the_numbers_on_the_screen_larger(monkeypatch)
     assert simulation.snapshot.pace == pytest.approx(0.4, rel=0.2)
 
 
-def test_it_runs_in_real_time_whatever_is_asked_meanwhile(live):
+def test_it_runs_in_real_time_during_commands(live):
     simulation, steps = live(paused=True), []
 
     def quick():  # as on a machine that is never late
@@ -189,7 +189,7 @@ def test_launch_drop_and_gravity(live):
     assert result.x[:, 1].min() == pytest.approx(0.4, abs=1e-5), "it hovers"
 
 
-def test_a_held_body_comes_to_the_hand_and_flies_on(live):
+def test_a_held_body_follows_the_hand_and_keeps_its_velocity(live):
     simulation = live(height=0.4)
     simulation.set_gravity(0.0)
     simulation.hold((0.7, 0.6, 0.5))
@@ -205,7 +205,7 @@ def test_a_held_body_comes_to_the_hand_and_flies_on(live):
     assert reached(simulation, lambda s: s.time > result.time + 0.4).trouble is None, "never through a wall"
 
 
-def test_the_weight_of_the_adaptor_goes_from_the_prior_on(live):
+def test_the_weight_of_the_adaptor_is_kept_by_other_laws(live):
     law = neural_law(seed=1)
     law.attach_adaptor(rank=4, seed=1)
     simulation = live(law, paused=True)
@@ -220,7 +220,7 @@ def test_the_weight_of_the_adaptor_goes_from_the_prior_on(live):
     assert {part.adaptor.weight for part in law.parts.values()} == {1.25}
 
 
-def test_bodies_are_put_above_each_other_until_there_is_no_room(live):
+def test_bodies_are_added_above_each_other_while_there_is_room(live):
     simulation = live(height=0.2, paused=True)
     law = make_law("hencky", torch.float32)
     simulation.add(start(), law, 5e-4)
@@ -235,7 +235,7 @@ def test_bodies_are_put_above_each_other_until_there_is_no_room(live):
     assert result.trouble is None
 
 
-def test_a_network_is_not_simulated_at_another_step_than_its_own(live):
+def test_a_network_is_simulated_at_its_own_step_only(live):
     simulation, network = live(height=0.2, paused=True), neural_law(seed=1)
     simulation.set_law(network, DT)
     assert simulation.do().notice is None
@@ -252,8 +252,8 @@ def test_a_network_is_not_simulated_at_another_step_than_its_own(live):
     assert result.notice is None and result.dt == DT / 2
 
 
-def test_commands_are_not_held_up_by_a_slow_law(live):
-    """Whatever a frame takes, the next command comes right after it."""
+def test_commands_are_not_delayed_by_a_slow_law(live):
+    """A command is executed after the current frame, however long it takes."""
 
     class Slow(Elasticity):
         def response(self, F, weights):

@@ -1,4 +1,4 @@
-"""A reconstructed body to play with: its laws, its Gaussians, and what is put on top of it."""
+"""The playground of a reconstructed body: laws, Gaussians and added bodies."""
 
 import threading
 
@@ -64,7 +64,7 @@ def test_a_law_outside_the_folders_is_not_read(project, playground, tmp_path):
     assert playground.chosen == before and playground.simulation.do().trouble is None
 
 
-def test_a_law_takes_its_first_step_in_the_thread_that_reads_it(project, monkeypatch):
+def test_a_law_takes_its_first_step_in_the_thread_that_loads_it(project, monkeypatch):
     files, laws = project
     steps = []
 
@@ -79,7 +79,7 @@ def test_a_law_takes_its_first_step_in_the_thread_that_reads_it(project, monkeyp
     assert steps == [(here, playground.law(name).name, 1e-3, 1) for name in (CONSTANTS, PRIOR)]
 
 
-def test_gaussians_follow_what_is_simulated(playground):
+def test_gaussians_follow_the_simulation(playground):
     snapshot = playground.simulation.do()
     picture = playground.picture(snapshot)
     assert isinstance(picture.gaussians, Gaussians)
@@ -94,7 +94,7 @@ def test_gaussians_follow_what_is_simulated(playground):
         assert values.shape == (400,) and values.isfinite().all()
 
 
-def test_a_letter_lands_on_top_and_goes_with_a_reset(playground):
+def test_an_added_letter_is_removed_by_a_reset(playground):
     playground.simulation.drop(0.0)
     assert playground.add("letter_N") is None
     snapshot = playground.simulation.do()

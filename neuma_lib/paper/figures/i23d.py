@@ -28,28 +28,27 @@ def data(inputs, params, log) -> ImageGrid:
     laws, splats = len(params.laws), list(params.splats)
     files = zip(inputs.particles, inputs.binding, inputs.gaussians, strict=True)
     bodies = [load_reconstruction(*of_body, DENSITY, gaussian_motion="affine") for of_body in files]
-    paths = [read_arrays(file, required=("frames",), only=("frames",)) for file in inputs.rollouts]
-    motions = []
-    for file, (arrays, _) in zip(inputs.rollouts, paths, strict=True):
+    motions, times = [], []
+    for file in inputs.rollouts:
+        arrays, attributes = read_arrays(file, required=("frames",), only=("frames",))
         picked = rendering.evenly(params.shown, len(arrays["frames"]))
         motions.append([torch.as_tensor(state[picked]) for state in load_motion(file)])
+        times.append(rendering.milliseconds(arrays["frames"][picked], attributes["dt"]))
     around = [rendering.seen_around(bodies[k // laws], *motion) for k, motion in enumerate(motions)]
     clouds = [np.concatenate(around[k : k + laws]) for k in range(0, len(around), laws)]
     width, height = rendering.picture_size(
         *np.max([np.ptp(cloud, axis=0)[:2] for cloud in clouds], axis=0), params.size
     )
-    pictures, times = [], []
-    for k, (arrays, attributes) in enumerate(paths):
-        body, cameras = bodies[k // laws], rendering.frontal(clouds[k // laws], width, height)
-        picked = rendering.evenly(params.shown, len(arrays["frames"]))
-        pictures.append(rendering.renders(body, cameras, *motions[k]))
-        times = times or rendering.milliseconds(arrays["frames"][picked], attributes["dt"])
+    cameras = [rendering.frontal(cloud, width, height) for cloud in clouds]
+    pictures = [
+        rendering.renders(bodies[k // laws], cameras[k // laws], *motion) for k, motion in enumerate(motions)
+    ]
     diverged = [k for k, file in enumerate(inputs.reports) if read_json(file)["diverged"]]
     log(f"{len(splats)} splats under {laws} laws" + (f"; {len(diverged)} broke off" if diverged else ""))
     titles = [f"{splat}, {law}" for splat in splats for law in params.laws]
     groups = [np.stack(pictures[k : k + laws]) for k in range(0, len(pictures), laws)]
     numbers = {"laws": laws, "diverged": diverged}
-    return ImageGrid(np.concatenate(rendering.cropped(groups)), tuple(titles), tuple(times), numbers)
+    return ImageGrid(np.concatenate(rendering.cropped(groups)), tuple(titles), tuple(times[0]), numbers)
 
 
 @style.styled
