@@ -119,6 +119,17 @@ def test_a_missing_or_broken_cell_is_named():
         chamfer_table(broken, {"nclaw": "NCLaw"}, column)
 
 
+def test_only_replicates_above_twice_the_mean_of_their_cell_are_named():
+    metrics = {
+        "nclaw": {"a": [run(5.0)] * 3, "b": [run(1.0), run(1.0), run(3.0)]},
+        "neuma": {"a": [run(1.0), run(9.0), run(1.0)], "b": [run(2.0)] * 3},
+    }
+    table = chamfer_table(metrics, TITLES, {"a": "A", "b": "b"})
+    assert table.outliers() == [
+        "NeuMA on A, replicate 2 of 3: 9.0 mm, more than twice the mean of its replicates."
+    ]
+
+
 # ---- verdicts
 
 METHODS = {**TITLES, "other": "Other"}
