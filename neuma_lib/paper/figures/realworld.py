@@ -48,24 +48,12 @@ def data(inputs, params, log) -> ImageGrid:
             measures[-1].append([float(np.mean([m[key] for m in means])) for key in ("psnr", "lpips_vgg")])
         blocks.append(np.stack(rows))
         times.append(rendering.milliseconds(seen.frames, setting["dt"]))
-    images = _one_size(rendering.cropped([block[None] for block in blocks]))
-    count = images.shape[1]
+    count = min(block.shape[1] for block in blocks)
+    images = np.concatenate([block[:, :count] for block in rendering.cropped(blocks)])
     log(f"{len(blocks)} takes, {images.shape[0]} x {count} pictures")
     titles = [title for _ in blocks for title in ("video", *params.titles.values())]
     numbers = {"scenes": list(params.scenes), "measures": measures, "times": [t[:count] for t in times]}
     return ImageGrid(images, tuple(titles), tuple(str(k) for k in range(count)), numbers)
-
-
-def _one_size(blocks: list[np.ndarray]) -> np.ndarray:
-    """Join blocks (1, R, C, H, W, 3), padded with white at the right and below, with their common number of columns."""
-    columns = min(block.shape[2] for block in blocks)
-    height, width = (max(block.shape[axis] for block in blocks) for axis in (3, 4))
-    joined = []
-    for block in blocks:
-        padded = np.full((*block.shape[1:2], columns, height, width, 3), 255, np.uint8)
-        padded[:, :, : block.shape[3], : block.shape[4]] = block[0, :, :columns]
-        joined.append(padded)
-    return np.concatenate(joined)
 
 
 @style.styled
