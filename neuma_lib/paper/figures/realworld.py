@@ -18,8 +18,6 @@ from neuma_lib.io.particles import load_motion, load_reconstruction
 from neuma_lib.paper.image_grid import GAP, ImageGrid, draw_images, note
 
 LEFT, TOP, UNDER = 0.92, 0.3, 0.12
-DENSITY = 1000.0
-"""Density of all bodies [kg/m^3]. It does not affect the pictures."""
 
 
 def data(inputs, params, log) -> ImageGrid:
@@ -37,7 +35,7 @@ def data(inputs, params, log) -> ImageGrid:
         rows = [rendering.as_bytes(seen.colours()[:, 0])]
         measures.append([])
         for method in params.titles:
-            body = load_reconstruction(*files, DENSITY, gaussian_motion=setting["motion"][method])
+            body = load_reconstruction(*files, rendering.DENSITY, gaussian_motion=setting["motion"][method])
             rollout = next(rollouts)
             steps = read_arrays(rollout, required=("frames",), only=("frames",))[0]["frames"].tolist()
             renders = Filmed(body.particle_gs(video.cameras), seen, steps)
