@@ -51,11 +51,14 @@ def test_a_new_scene_is_valid_and_named_in_the_next_commands(project, capsys):
 
 
 @core
-def test_a_new_capture_is_valid_and_becomes_a_scene(project, capsys):
+def test_a_new_capture_is_valid_and_becomes_a_scene(project, capsys, monkeypatch):
     assert main(["new", "capture", "mug"]) == 0
     names = {"capture.yaml", "photos", "stills", "videos"}
     assert {p.name for p in (project / "captures/mug").iterdir()} == names
     assert main(["check"]) == 0 and main(["check", "captures/mug/capture.yaml"]) == 0
+    with monkeypatch.context() as inside:
+        inside.chdir("captures/mug")
+        assert main(["check", "capture.yaml"]) == 0
     assert main(["new", "capture", "mug"]) == 1
     (project / "captures/mug/capture.yaml").write_text("board: {square: -1}\n")
     capsys.readouterr()

@@ -238,14 +238,16 @@ def _evaluate(
     gaussians: Gaussians, views: _Views, chosen: list[int], exposures: Tensor | None
 ) -> tuple[float, float]:
     """Mean PSNR [dB] over chosen views with respect to RGBA images over white: full frame, and where alpha > 1/2."""
-    sh, errors = gaussians.sh(), []
-    for view in chosen:
+    sh = gaussians.sh()
+
+    def error(view: int) -> tuple[Tensor, Tensor]:
         exposed = sh if exposures is None else _exposed(sh, exposures[view])
         picture, _ = _render(gaussians, exposed, views.cameras[view])
         rgba = views.images[view]
-        error = (picture.clamp(0, 1) - (rgba[..., :3] * rgba[..., 3:] + 1 - rgba[..., 3:])) ** 2
-        errors.append((error, rgba[..., 3]))
-    return mean_psnr(errors)
+        white = rgba[..., :3] * rgba[..., 3:] + 1 - rgba[..., 3:]
+        return (picture.clamp(0, 1) - white) ** 2, rgba[..., 3]
+
+    return mean_psnr(map(error, chosen))  # one view at a time in memory
 
 
 class _Fit:

@@ -53,7 +53,7 @@ class Preset:
 
 
 class Case(ABC):
-    """A preset or variant on a scene: its options, and where files are. `neuma_lib.project.project.cases` builds it.
+    """A preset or variant on a scene: its options, and where files are. `neuma_lib.project.cases` builds it.
 
     Attributes:
         scene: folder of the scene that the model is obtained from, with the seeds of its replicate.

@@ -38,7 +38,7 @@ def capture_problems(folders: Iterable[Path]) -> list[str]:
     problems = []
     for folder in folders:
         try:
-            if not NAME.fullmatch(folder.name):
+            if not NAME.fullmatch(folder.absolute().name):
                 raise InputError(folder, "the name is invalid", "Use letters, digits, - and _")
             training_takes(read_capture(folder))
         except InputError as error:

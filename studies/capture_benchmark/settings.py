@@ -94,7 +94,7 @@ class DemoPhotographsConfig(Section):
     rings: tuple[int, ...] = Field((17, 17), description="photographs in each ring")
     elevations: tuple[float, ...] = Field((30.0, 58.0), description="of the rings above the floor [degrees]")
     distances: tuple[float, ...] = Field((1.0, 0.9), description="of the rings from their target [m]")
-    beside_cameras: int = Field(2, ge=0, description="more cameras next to each video camera")
+    beside_cameras: int = Field(2, ge=0, description="more photographs next to each video camera")
     target: Vector = Field(
         (-0.12, 0.08, 0.0), description="centre of the pictures, with random deviations [m]"
     )

@@ -44,10 +44,8 @@ from neuma_lib.capture.masks.silhouettes import learn_palette, silhouette
 from neuma_lib.capture.motion.ballistic_tracks import BallisticTrack, find_ballistic_tracks
 from neuma_lib.errors import InputError
 
-_SURE, _POSSIBLE = (
-    30.0,
-    12.0,
-)  # differences that are certainly, and possibly without noise, an object [levels of 255]
+_SURE = 30.0  # difference from the background that is certainly an object [levels of 255]
+_POSSIBLE = 12.0  # difference that may be an object in a picture without noise [levels of 255]
 _MAX_NOISE = 6.0  # maximum standard deviation of a camera's noise [levels]; larger differences are motion
 _ROUNDS = 2  # iterations of learning colours and drawing silhouettes
 _LOST = 2  # frames after which a lost object is no longer searched for

@@ -27,9 +27,7 @@ STRESS_UNITS = {
 }
 """Units of constants that are proportional to stress."""
 OTHER_UNITS = {"friction_angle": "°", "dilation_angle": "°", "relaxation_time": "s"}
-_UNKNOWN = (
-    100.0  # factor between value and limit of two standard deviations above which a constant is unknown
-)
+_UNKNOWN = 100.0  # factor of two standard deviations above which a constant is unknown
 MEASURES = {
     "psnr": ("PSNR, object [dB]", 1),
     "ssim": ("SSIM, object", 3),
