@@ -52,7 +52,7 @@ def benchmark_table(scenes: Mapping[str, Mapping[str, Any]]) -> tuple[str, str]:
             f"Step size, velocity and height are the paper's ({BENCHMARKS_LABEL}) for {', '.join(same)}."
         )
     if other:
-        remarks.append(f"They differ from it for {', '.join(other)}; the paper's numbers stand in brackets.")
+        remarks.append(f"They differ from it for {', '.join(other)}. The paper's numbers are in brackets.")
     text = [
         "# Table 4: the benchmarks",
         "",

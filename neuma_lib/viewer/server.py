@@ -26,6 +26,8 @@ from neuma_lib.viewer.scene import Motion, Scene, frame_at
 
 RECORDED, LIVE = "recorded", "live"
 NOTHING, SEEN, DISTANCE = "nothing", "Gaussians", "Gaussians by distance of both"
+BY_QUANTITY = {f"particles by {quantity.label}": name for name, quantity in QUANTITIES.items()}
+"""Entry of the list "show" -> name of the quantity."""
 OFFSET = 1.15
 """Offset of the second box from the first [m]."""
 PACES = {"1/32": 1 / 32, "1/16": 1 / 16, "1/8": 1 / 8, "1/4": 1 / 4, "real time": 1.0}
@@ -64,6 +66,8 @@ class ViewerServer:
         self._closing, self._dirty, self._playing = threading.Event(), True, False
         self._clock, self._number, self._nodes = 0.0, -1, {}
         self._reach: dict[tuple[str, str], float] = {}
+        self._message: str | None = None
+        self._text_time, self._trouble = 0.0, (None, None, None)
         self._room()
         self._controls()
         if playground:
@@ -129,8 +133,7 @@ class ViewerServer:
         modes = [RECORDED, LIVE] if self.playground else [RECORDED]
         add["mode"] = gui.add_dropdown("mode", modes)
         self._status = gui.add_markdown("")
-        show = [SEEN, DISTANCE, *(f"particles by {quantity.label}" for quantity in QUANTITIES.values())]
-        add["show"] = gui.add_dropdown("show", show)
+        add["show"] = gui.add_dropdown("show", [SEEN, DISTANCE, *BY_QUANTITY])
         self._bar = gui.add_image(colour_bar("viridis"), visible=False)
         self._legend = gui.add_markdown("", visible=False)
         titles = [motion.title for motion in self.scene.motions]
@@ -213,9 +216,6 @@ class ViewerServer:
             self._message = str(error)
         self._dirty = True
 
-    _message: str | None = None
-    _text_time, _trouble = 0.0, (None, None, None)
-
     def _play(self, playing: bool) -> None:
         self._playing = playing
         self.gui["play"].label = "Pause" if playing else "Play"
@@ -296,7 +296,7 @@ class ViewerServer:
         self, side: str, motion: Motion, step: int, display: str, other: Motion | None, text: list[str]
     ) -> None:
         frame = frame_at(motion.steps, step)
-        name = quantity_named(display)
+        name = BY_QUANTITY.get(display)
         if name is None:
             if motion.means is None:
                 text.append(f"{motion.title} carries no Gaussians: show its particles")
@@ -326,8 +326,7 @@ class ViewerServer:
         self._number, self._dirty = snapshot.number, False
         self._turn(play.simulation.floor)
         self._nodes["right", "frame"].visible = False
-        display = self.gui["show"].value
-        name = quantity_named(display)
+        name = BY_QUANTITY.get(self.gui["show"].value)
         with self.server.atomic():
             if name is None:
                 picture: Picture = play.picture(snapshot, self.gui["flow"].value)
@@ -426,11 +425,6 @@ def invisible_ball(radius: float) -> trimesh.Trimesh:
     transparent = PBRMaterial(baseColorFactor=(255, 255, 255, 0), alphaMode="BLEND")
     ball.visual = TextureVisuals(material=transparent)
     return ball
-
-
-def quantity_named(display: str) -> str | None:
-    """Name of the quantity of an entry of the list "show"; None for Gaussians."""
-    return next((name for name, q in QUANTITIES.items() if display == f"particles by {q.label}"), None)
 
 
 def colours(name: str, share: np.ndarray) -> np.ndarray:

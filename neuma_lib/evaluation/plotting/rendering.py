@@ -20,6 +20,8 @@ from neuma_lib.splatting.extent import outermost
 from neuma_lib.splatting.observation import Observation
 from neuma_lib.splatting.viewpoints import video_views
 
+DENSITY = 1000.0
+"""Density of bodies whose pictures do not depend on it [kg/m^3]."""
 _WHITE = 250
 """Minimum value of a background colour."""
 _FLATTEST, _TALLEST = 0.6, 1.5
@@ -43,6 +45,12 @@ def film(inputs, params, k: int, density: Density) -> tuple[Observation, Reconst
     video = load_observation(inputs.transforms[k], [params.view])
     body = load_reconstruction(inputs.particles[k], inputs.binding[k], inputs.gaussians[k], density)
     return video, body, magnified(video.cameras, params.magnify)
+
+
+def bodies(inputs, **options) -> list[Reconstruction]:
+    """All bodies of a figure, for pictures only."""
+    files = zip(inputs.particles, inputs.binding, inputs.gaussians, strict=True)
+    return [load_reconstruction(*of_body, DENSITY, **options) for of_body in files]
 
 
 def picture_size(wide: float, high: float, width: int) -> tuple[int, int]:

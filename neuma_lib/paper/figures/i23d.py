@@ -12,12 +12,10 @@ from matplotlib.figure import Figure
 from neuma_lib.evaluation.plotting import rendering, style
 from neuma_lib.io.files import read_json
 from neuma_lib.io.hdf5 import read_arrays
-from neuma_lib.io.particles import load_motion, load_reconstruction
+from neuma_lib.io.particles import load_motion
 from neuma_lib.paper.image_grid import ImageGrid, rows_figure
 
 LEFT, TOP = 1.05, 0.2
-DENSITY = 1000.0
-"""Density of all bodies [kg/m^3]. It does not affect the pictures."""
 
 
 def data(inputs, params, log) -> ImageGrid:
@@ -26,8 +24,7 @@ def data(inputs, params, log) -> ImageGrid:
     Numbers: ``laws``, number of rows of a splat; ``diverged``, rows with a prediction that stopped early.
     """
     laws, splats = len(params.laws), list(params.splats)
-    files = zip(inputs.particles, inputs.binding, inputs.gaussians, strict=True)
-    bodies = [load_reconstruction(*of_body, DENSITY, gaussian_motion="affine") for of_body in files]
+    bodies = rendering.bodies(inputs, gaussian_motion="affine")
     motions, times = [], []
     for file in inputs.rollouts:
         arrays, attributes = read_arrays(file, required=("frames",), only=("frames",))

@@ -18,8 +18,6 @@ from neuma_lib.io.particles import load_motion, load_reconstruction
 from neuma_lib.paper.image_grid import GAP, ImageGrid, draw_images, note
 
 LEFT, TOP, UNDER = 0.92, 0.3, 0.12
-DENSITY = 1000.0
-"""Density of all bodies [kg/m^3]. It does not affect the pictures."""
 
 
 def data(inputs, params, log) -> ImageGrid:
@@ -37,7 +35,7 @@ def data(inputs, params, log) -> ImageGrid:
         rows = [rendering.as_bytes(seen.colours()[:, 0])]
         measures.append([])
         for method in params.titles:
-            body = load_reconstruction(*files, DENSITY, gaussian_motion=setting["motion"][method])
+            body = load_reconstruction(*files, rendering.DENSITY, gaussian_motion=setting["motion"][method])
             rollout = next(rollouts)
             steps = read_arrays(rollout, required=("frames",), only=("frames",))[0]["frames"].tolist()
             renders = Filmed(body.particle_gs(video.cameras), seen, steps)
@@ -48,24 +46,12 @@ def data(inputs, params, log) -> ImageGrid:
             measures[-1].append([float(np.mean([m[key] for m in means])) for key in ("psnr", "lpips_vgg")])
         blocks.append(np.stack(rows))
         times.append(rendering.milliseconds(seen.frames, setting["dt"]))
-    images = _one_size(rendering.cropped([block[None] for block in blocks]))
-    count = images.shape[1]
+    count = min(block.shape[1] for block in blocks)
+    images = np.concatenate([block[:, :count] for block in rendering.cropped(blocks)])
     log(f"{len(blocks)} takes, {images.shape[0]} x {count} pictures")
     titles = [title for _ in blocks for title in ("video", *params.titles.values())]
     numbers = {"scenes": list(params.scenes), "measures": measures, "times": [t[:count] for t in times]}
     return ImageGrid(images, tuple(titles), tuple(str(k) for k in range(count)), numbers)
-
-
-def _one_size(blocks: list[np.ndarray]) -> np.ndarray:
-    """Join blocks (1, R, C, H, W, 3), padded with white at the right and below, with their common number of columns."""
-    columns = min(block.shape[2] for block in blocks)
-    height, width = (max(block.shape[axis] for block in blocks) for axis in (3, 4))
-    joined = []
-    for block in blocks:
-        padded = np.full((*block.shape[1:2], columns, height, width, 3), 255, np.uint8)
-        padded[:, :, : block.shape[3], : block.shape[4]] = block[0, :, :columns]
-        joined.append(padded)
-    return np.concatenate(joined)
 
 
 @style.styled

@@ -10,12 +10,10 @@ from matplotlib.figure import Figure
 
 from neuma_lib.evaluation.plotting import rendering, style
 from neuma_lib.io.hdf5 import read_arrays
-from neuma_lib.io.particles import load_motion, load_reconstruction
+from neuma_lib.io.particles import load_motion
 from neuma_lib.paper.image_grid import GAP, ImageGrid, draw_images, note
 
 LEFT, TOP, BETWEEN = 0.92, 0.36, 0.42
-DENSITY = 1000.0
-"""Density of all bodies [kg/m^3]. It does not affect the pictures."""
 
 
 def data(inputs, params, log) -> ImageGrid:
@@ -24,8 +22,7 @@ def data(inputs, params, log) -> ImageGrid:
     Numbers: ``letters``, number of rows of (a); ``materials``, of the letters; ``times``, column titles of (b).
     """
     paths = [read_arrays(file, required=("x", "frames"), only=("x", "frames")) for file in inputs.rollouts]
-    reconstructed = zip(inputs.particles, inputs.binding, inputs.gaussians, strict=True)
-    bodies = [load_reconstruction(*files, DENSITY) for files in reconstructed]
+    bodies = rendering.bodies(inputs)
     letters, count = len(params.letters), len(params.letters) or params.shown
     points = np.concatenate([arrays["x"].reshape(-1, 3) for arrays, _ in paths[:letters] or paths])
     width, height = rendering.picture_size(*np.ptp(points, axis=0)[:2], params.size)
