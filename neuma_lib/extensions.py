@@ -30,9 +30,8 @@ def load_module(name: str) -> ModuleType:
     if known is not None and known.__file__ == str(path):
         return known
     if not path.is_file():
-        raise InputError(
-            f"extensions: {name}", "the file does not exist", "Paths are relative to the project"
-        )
+        remedy = "Paths are relative to the working directory, not to the settings file"
+        raise InputError(f"extensions: {name}", f"the file {path} does not exist", remedy)
     spec = importlib.util.spec_from_file_location(name, path)
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module

@@ -1,5 +1,7 @@
 """The package: what an import loads, what a missing extra is answered with, what an archive holds."""
 
+import pkgutil
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -30,6 +32,41 @@ def test_every_public_name_is_there():
     assert set(neuma_lib.__all__) <= set(dir(neuma_lib))
     with pytest.raises(AttributeError):
         neuma_lib.simulation_of_everything  # noqa: B018
+
+
+def on_page(text: str) -> list[tuple[str, str]]:
+    """Module or name of each ``:::`` entry of a page, and each of its members."""
+    entries = re.findall(r"^::: (\S+)\n((?: +.*\n)*)", text, re.MULTILINE)
+    return [
+        (path, name)
+        for path, options in entries
+        for name in re.findall(r"\w+", "".join(re.findall(r"members: \[(.*)\]", options))) or [""]
+    ]
+
+
+@pytest.mark.parametrize("page", sorted((ROOT / "docs/api").glob("*.md")), ids=lambda page: page.stem)
+def test_every_name_on_a_page_is_there(page):
+    """mkdocs leaves members out that do not exist, without a warning."""
+    missing = [
+        (path, name) for path, name in on_page(page.read_text()) if not found(f"{path}.{name}".rstrip("."))
+    ]
+    assert not missing
+
+
+def test_every_name_on_the_page_of_the_method_is_there():
+    names = re.findall(r"`([a-z_]+(?:\.\w+)+)`", (ROOT / "docs/method.md").read_text())
+    rooms = {path.name for path in (ROOT / "neuma_lib").iterdir() if path.is_dir()}
+    named = {f"neuma_lib.{name}" for name in names if name.split(".")[0] in rooms}
+    assert len(named) > 20
+    assert not {name for name in named if not found(name)}
+
+
+def found(path: str) -> bool:
+    try:
+        pkgutil.resolve_name(path)
+    except (ImportError, AttributeError):
+        return False
+    return True
 
 
 BLOCKED = """

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from torch import Tensor
+
 from neuma_lib.errors import InputError
 from neuma_lib.mechanics.catalogue import complete
 from neuma_lib.mechanics.elasticity import ELASTICITIES
@@ -52,6 +54,10 @@ def specification(elasticity: Elasticity, plasticity: Plasticity) -> dict[str, A
                 key, problem, "Derive it from AnalyticElasticity or AnalyticPlasticity, with a name"
             )
     return {
-        name: {"name": name_of(part), **{key: float(value) for key, value in part.values.items()}}
+        name: {"name": name_of(part), **{key: _number(value) for key, value in part.values.items()}}
         for name, part in parts.items()
     }
+
+
+def _number(value: float | Tensor) -> float:
+    return float(value.detach() if isinstance(value, Tensor) else value)

@@ -40,9 +40,10 @@ class Constant:
     @property
     def bounds(self) -> str:
         """The interval in words that follow "must"."""
+        unit = "" if self.unit in ("", "1") else f" {self.unit}"
         if math.isfinite(self.high):
-            return f"lie between {self.low:g} and {self.high:g} {self.unit}"
-        return f"be {'at least' if self.closed else 'greater than'} {self.low:g} {self.unit}"
+            return f"lie between {self.low:g} and {self.high:g}{unit}"
+        return f"be {'at least' if self.closed else 'greater than'} {self.low:g}{unit}"
 
 
 YOUNG = Constant("Pa", 0.0)
@@ -126,8 +127,12 @@ def register(part: str, name: str, constants: Mapping[str, Constant], module: st
         InputError: another module has a law with this name.
     """
     laws = {"elasticity": ELASTICITY, "plasticity": PLASTICITY}[part]
-    if name in laws and DEFINED_IN.get((part, name)) != module:
-        raise InputError(module, f"another {part} has the name {name!r}", "Choose another name")
+    if name in laws and (other := DEFINED_IN.get((part, name))) != module:
+        owner = f"{other} defines" if other else "the built-in laws have"
+        remedy = "Choose another name. If it is the same file, load it only once: import it, or list it in extensions"
+        raise InputError(
+            module, f"{owner} another {part} {name!r}", remedy if other else "Choose another name"
+        )
     laws[name], DEFINED_IN[part, name] = dict(constants), module
 
 
@@ -190,7 +195,7 @@ def check_constants(
     for name, constant in constants.items():
         value = values.get(name, constant.default)
         if value is None:
-            raise InputError(f"{law}.{name}", f"the constant [{constant.unit}] is missing")
+            raise InputError(f"{law}.{name}", f"this constant is missing. It must {constant.bounds}")
         try:
             numbers[name] = float(value)
         except (TypeError, ValueError):
@@ -241,4 +246,6 @@ def _known_name(part: str, values: Mapping[str, Any], choices: Mapping[str, Any]
         return name
     close = get_close_matches(str(name), choices, n=1)
     hint = f"; did you mean {close[0]}?" if close else ""
-    raise InputError(f"{part}.name", f"{name!r} is unknown{hint}", f"Choose one of {', '.join(choices)}")
+    own = "A law of your own is known after its module is imported, in settings by extensions"
+    remedy = f"Choose one of {', '.join(choices)}. {own}"
+    raise InputError(f"{part}.name", f"{name!r} is unknown{hint}", remedy)
