@@ -13,7 +13,7 @@ from neuma_lib.errors import InputError
 from neuma_lib.evaluation.material_point import Visited
 from neuma_lib.evaluation.plotting import style
 from neuma_lib.evaluation.response import tests_within
-from neuma_lib.evaluation.stress_curves import VISITED
+from neuma_lib.evaluation.stress_curves import draw_visited
 from neuma_lib.io.files import one_line
 from neuma_lib.mechanics.law import Law
 
@@ -39,9 +39,7 @@ def law_page(law: Law, about: Mapping[str, Any]) -> Figure:
     for axes, (name, (xlabel, ylabel)) in zip(figure.subplots(1, len(TESTS)), TESTS.items(), strict=True):
         test = tests[name]
         if largest is not None:
-            low, high = (1e-3 * np.asarray(test.visited)) if test.by_stress else test.visited
-            span = axes.axhspan if test.by_stress else axes.axvspan
-            span(low, high, color=VISITED, linewidth=0, zorder=0)
+            draw_visited(axes, test.visited, test.by_stress, zorder=0)
         axes.plot(test.x, 1e-3 * test.curve(law, test.x), color=style.BLUE)
         axes.axhline(0, color=style.GREY, linewidth=0.4, zorder=0.5)
         axes.set(xlabel=xlabel.format(rate=settings.shear_rate), ylabel=f"{ylabel} [kPa]")

@@ -88,10 +88,15 @@ def response(law: Law, truth: Law, test: PointTest, draws: Sequence[Law] = ()) -
         "true": test.curve(truth, test.x).tolist(),
     }
     if draws:
-        x = test.x[::EVERY].contiguous()
-        low, high = band(draws, lambda law: test.curve(law, x))
-        curves["band"] = {"x": x.tolist(), "low": low.tolist(), "high": high.tolist()}
+        curves["band"] = band_of_test(test, draws)
     return curves
+
+
+def band_of_test(test: PointTest, draws: Sequence[Law], scale: float = 1.0) -> dict[str, list[float]]:
+    """Band of sampled laws at every `EVERY`-th point: ``x``, and ``low`` and ``high`` [Pa] times ``scale``."""
+    x = test.x[::EVERY].contiguous()
+    low, high = band(draws, lambda law: test.curve(law, x))
+    return {"x": x.tolist(), "low": (scale * low).tolist(), "high": (scale * high).tolist()}
 
 
 def inside(curves: Mapping[str, Any]) -> float | None:

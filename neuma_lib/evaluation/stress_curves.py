@@ -7,7 +7,6 @@ simulated one divided by the square of the scale.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,9 +14,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from torch import Tensor
 
-from neuma_lib.evaluation.bands import band
 from neuma_lib.evaluation.plotting import style
-from neuma_lib.evaluation.response import EVERY, PointTest, inside, material_tests
+from neuma_lib.evaluation.response import band_of_test, inside, material_tests
 from neuma_lib.mechanics.law import Law
 
 TESTS = {
@@ -60,26 +58,17 @@ def stress_curves(
     per = 1 / scale**2
     tests: dict[str, Any] = {}
     for name, test in material_tests(laws[learned], F, rate, total_shear, dt).items():
-        curves: dict[str, Any] = {}
-        for method, law in laws.items():
-            curves[method] = {"stress": (per * test.curve(law, test.x)).tolist(), "band": None}
-            if draws.get(method):
-                x = test.x[::EVERY].contiguous()
-                low, high = band(draws[method], partial(_curve, test, x))
-                ends = {"low": (per * low).tolist(), "high": (per * high).tolist()}
-                curves[method]["band"] = {"x": x.tolist(), **ends}
-        visited = [per * end for end in test.visited] if test.by_stress else list(test.visited)
-        tests[name] = {
-            "x": test.x.tolist(),
-            "visited": visited,
-            "by_stress": test.by_stress,
-            "laws": curves,
+        curves = {
+            method: {
+                "stress": (per * test.curve(law, test.x)).tolist(),
+                "band": band_of_test(test, draws[method], per) if draws.get(method) else None,
+            }
+            for method, law in laws.items()
         }
+        visited = [per * end for end in test.visited] if test.by_stress else list(test.visited)
+        shared = {"x": test.x.tolist(), "visited": visited, "by_stress": test.by_stress}
+        tests[name] = {**shared, "laws": curves}
     return {"rate": rate, "learned": learned, "tests": tests}
-
-
-def _curve(test: PointTest, x: Tensor, law: Law) -> Tensor:
-    return test.curve(law, x)
 
 
 def share_inside(test: Mapping[str, Any], method: str, band_of: str) -> float | None:
@@ -113,19 +102,33 @@ def draw(curves: Mapping[str, Any], titles: Mapping[str, str]) -> Figure:
 
 
 def _panel(axes, test: Mapping[str, Any], titles: Mapping[str, str], learned: str) -> None:
-    x = np.asarray(test["x"])
-    span, unit = (axes.axhspan, 1e-3) if test["by_stress"] else (axes.axvspan, 1.0)
-    span(*(unit * end for end in test["visited"]), color=VISITED, linewidth=0, label="seen in the video")
+    draw_visited(axes, test["visited"], test["by_stress"], label="seen in the video")
+    draw_laws(axes, test, titles, thick=learned)
+    set_limits(axes, test["x"], *_limits(test, learned))
+
+
+def draw_visited(axes, visited: Sequence[float], by_stress: bool, **options) -> None:
+    """Mark the visited range of a test, in stresses [Pa] or in prescribed values."""
+    span, unit = (axes.axhspan, 1e-3) if by_stress else (axes.axvspan, 1.0)
+    span(*(unit * end for end in visited), color=VISITED, linewidth=0, **options)
+
+
+def draw_laws(axes, test: Mapping[str, Any], titles: Mapping[str, str], thick: str | None = None) -> None:
+    """Draw the curves of all laws [kPa] with their bands."""
     for method, law in test["laws"].items():
         line = style.look(method).line
         if law["band"]:
             ends = [1e-3 * np.asarray(law["band"][end]) for end in ("low", "high")]
             axes.fill_between(law["band"]["x"], *ends, color=line["color"], alpha=0.18, linewidth=0)
-        width = 1.8 if method == learned else 1.1
-        axes.plot(x, 1e-3 * np.asarray(law["stress"]), **line, linewidth=width, label=titles[method])
-    low, high = _limits(test, learned)
+        width = 1.8 if method == thick else 1.1
+        stress = 1e-3 * np.asarray(law["stress"])
+        axes.plot(test["x"], stress, **line, linewidth=width, label=titles[method])
+
+
+def set_limits(axes, x: Sequence[float], low: float, high: float) -> None:
+    """Limit a panel to the range of x and, with a margin, to stresses [kPa]."""
     margin = 0.08 * (high - low or 1.0)
-    axes.set(xlim=(x.min(), x.max()), ylim=(low - margin, high + margin))
+    axes.set(xlim=(min(x), max(x)), ylim=(low - margin, high + margin))
     axes.axhline(0, color=style.GREY, linewidth=0.4, zorder=0.5)
     axes.yaxis.set_major_locator(MaxNLocator(4))
 

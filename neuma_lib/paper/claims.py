@@ -1,7 +1,7 @@
 """Claims about methods, and their verdicts.
 
-A claim is a statement and a rule that checks it with a `Frame`, the errors of a run. Errors of motion are tracer RMSE,
-which sees all motion and has no sampling floor. The paper gives Chamfer distances only.
+A claim is a statement and a rule that checks it with a `Frame`, the errors of a run. The error is tracer RMSE, which
+measures all motion and has no sampling floor. The paper gives Chamfer distances only.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from neuma_lib.errors import InputError
 from neuma_lib.evaluation.text_tables import as_markdown
 
 RMSE = "tracer_rmse_mm"
@@ -32,14 +31,14 @@ VERDICTS = ("claim", "verdict", "RMSE here (mm)", "Chamfer distance in the paper
 RULE = (
     "A claim *holds* if its methods are lower on average and in most columns, the intervals mean ± standard deviation "
     f"of the averages do not overlap, there are at least {MIN_REPLICATES} replicates, and no prediction of these "
-    "broke off. It *does not hold* if neither the average nor most columns are on its side; else it is *mixed*."
+    "broke off. It *does not hold* if neither the average nor most columns support it, else it is *mixed*."
 )
-"""Explanation of `Closer` for readers of a table."""
+"""Explanation of `Closer`, in its documentation and for readers of a table."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """Values of one quantity and method: a line for each replicate, a column for each scene or experiment, (S, C)."""
+    """Values of one quantity and method, shape (replicates, columns). Columns are scenes or experiments."""
 
     quantity: str
     method: str
@@ -75,9 +74,9 @@ class Row:
         means = zip(self.mean, spreads, strict=True)
         return [text(v, digits) + (spread if np.isfinite(v) else "") for v, spread in means]
 
-    def average(self) -> str:
-        """The average over the columns as text, with its standard deviation for several replicates."""
-        return self.cells(1, shown)[-1]
+    def text(self, unit: str = "") -> str:
+        """Average over the columns, with its standard deviation for several replicates, and the title."""
+        return f"{self.cells(1, shown)[-1]}{unit} ({self.title})"
 
     def _averaged(self) -> np.ndarray:
         return np.concatenate([self.runs, self.runs.mean(axis=1, keepdims=True)], axis=1)
@@ -92,6 +91,12 @@ def shown(value: float, digits: int) -> str:
 def number(value: float, digits: int) -> str:
     """A number with fixed decimals, or a dash for NaN."""
     return f"{value:.{digits}f}" if np.isfinite(value) else "–"
+
+
+def spread_note(replicates: int) -> str:
+    """Explanation of ± in cells. Empty for a single replicate."""
+    note = f"± is the standard deviation over {replicates} replicates; after an average, of their averages."
+    return note if replicates > 1 else ""
 
 
 @dataclass
@@ -115,16 +120,6 @@ class Frame:
     def of(self, quantity: str) -> list[Row]:
         """Rows of all methods."""
         return [row for row in self.rows.values() if row.quantity == quantity]
-
-    def row(self, quantity: str, method: str) -> Row:
-        """One row.
-
-        Raises:
-            InputError: the frame does not have it.
-        """
-        if row := self.rows.get((quantity, method)):
-            return row
-        raise InputError("table", f"no row {quantity} of {method}", "Add the method to the table")
 
     def select(self, quantity: str, methods: Iterable[str], columns: Sequence[str]) -> list[Row] | None:
         """Rows of some methods in some columns (all if empty). None if the frame lacks a row or column."""
@@ -157,7 +152,7 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Claim(ABC):
-    """A statement about methods. Subclasses define how it is checked."""
+    """A statement about methods. Subclasses define the check."""
 
     text: str
 
@@ -168,14 +163,11 @@ class Claim(ABC):
 
 @dataclass(frozen=True)
 class Closer(Claim):
-    """Some methods are no further from the truth than others.
+    """Some methods are closer to the truth than others, by `RULE`.
 
-    The claim *holds* only if the average error is lower, it is lower in more than half of the columns, the intervals
-    mean ± standard deviation of the averages do not overlap, there are `MIN_REPLICATES` replicates, and no prediction
-    of the better methods stopped early, since its error is then too small. (For three replicates of equal spread, no
-    overlap means t > 2.4, which occurs by chance in 4 of 100 cases.) It *does not hold* if neither the average nor the
-    majority of columns supports it. Otherwise it is *mixed*. "No worse" is checked like "closer", since a difference
-    that is not seen may still exist.
+    For three replicates of equal spread, no overlap of the intervals means t > 2.4, which occurs by chance in 4 of 100
+    cases. Predictions that stop early do not count because their error is too small. "No worse" is checked like
+    "closer", since a difference that is not seen may still exist.
 
     Attributes:
         better, worse: methods. The worst of the first is compared with the best of the second.
@@ -193,29 +185,34 @@ class Closer(Claim):
         return {*self.better, *self.worse}
 
     def holds(self, frame: Frame) -> Verdict | None:
-        groups = [frame.select(RMSE, group, self.columns) for group in (self.better, self.worse)]
-        if None in groups:
+        better, worse = (frame.select(RMSE, group, self.columns) for group in (self.better, self.worse))
+        if better is None or worse is None:
             return None
-        better, worse = groups
         high, low = max(better, key=lambda r: r.mean[-1]), min(worse, key=lambda r: r.mean[-1])
         average = bool(high.mean[-1] < low.mean[-1])
-        first, second = (np.stack([row.mean[:-1] for row in rows]) for rows in groups)
+        first, second = (np.stack([row.mean[:-1] for row in rows]) for rows in (better, worse))
         lower, count = int((first.max(axis=0) < second.min(axis=0)).sum()), first.shape[1]
         majority = 2 * lower > count
-        caveats = ([] if average else ["not on average"]) + ([] if majority else ["not in most columns"])
-        if few := _too_few(*better, *worse):
-            caveats.append(few)
-        elif average and max(r.mean[-1] + r.std[-1] for r in better) >= min(
-            r.mean[-1] - r.std[-1] for r in worse
-        ):
-            caveats.append("the ± overlap")
-        if any((m, c) in frame.broken for m in self.better for c in self.columns or frame.columns):
-            caveats.append("a prediction broke off")
-        here = f"{high.average()} ({high.title}) against {low.average()} ({low.title}), lower in {lower} of {count}"
+        few = _too_few(*better, *worse)
+        overlap = (
+            average
+            and not few
+            and max(r.mean[-1] + r.std[-1] for r in better) >= min(r.mean[-1] - r.std[-1] for r in worse)
+        )
+        broke = any((m, c) in frame.broken for m in self.better for c in self.columns or frame.columns)
+        caveats = {
+            "not on average": not average,
+            "not in most columns": not majority,
+            few: few,
+            "the ± overlap": overlap,
+            "a prediction broke off": broke,
+        }
+        reasons = [text for text, applies in caveats.items() if applies]
+        here = f"{high.text()} against {low.text()}, lower in {lower} of {count}"
         if not (average or majority):
             return Verdict(self.text, FAILS, here, self._paper(frame))
-        here += f"; {', '.join(caveats)}" if caveats else ""
-        return Verdict(self.text, MIXED if caveats else HOLDS, here, self._paper(frame))
+        here += f"; {', '.join(reasons)}" if reasons else ""
+        return Verdict(self.text, MIXED if reasons else HOLDS, here, self._paper(frame))
 
     def _paper(self, frame: Frame) -> str:
         """The same comparison with the paper's distances."""
@@ -264,17 +261,17 @@ class Bound(Claim):
         within = row.mean <= bound
         surely = within if row.std is None else row.mean + row.std <= bound
         met, sure = (ok[-1] if self.count is None else ok[:-1].sum() >= self.count for ok in (within, surely))
-        caveats = [] if sure else ["not with the ±"]
-        caveats += filter(None, [_too_few(row)])
+        reasons = [] if sure else ["not with the ±"]
+        reasons += filter(None, [_too_few(row)])
         columns = self.columns or tuple(frame.columns)
-        away = sum((self.method, column) in frame.broken for column in columns)
-        if away and self.quantity != BROKEN:
-            caveats.append(f"broke off in {away} of {len(columns)}")
-        here = f"{row.average()} {'mm' if self.quantity == RMSE else '%'} ({row.title})"
-        here += f" against {of[0].average()} ({of[0].title})" if of else ""
+        broke = sum((self.method, column) in frame.broken for column in columns)
+        if broke and self.quantity != BROKEN:
+            reasons.append(f"broke off in {broke} of {len(columns)}")
+        here = row.text(" mm" if self.quantity == RMSE else " %")
+        here += f" against {of[0].text()}" if of else ""
         here += f", kept in {within[:-1].sum()} of {len(columns)}" if self.count is not None else ""
-        word = FAILS if not met else MIXED if caveats else HOLDS
-        return Verdict(self.text, word, "; ".join([here, *caveats]) if word == MIXED else here)
+        word = FAILS if not met else MIXED if reasons else HOLDS
+        return Verdict(self.text, word, "; ".join([here, *reasons]) if word == MIXED else here)
 
 
 def counted(
@@ -285,14 +282,15 @@ def counted(
     Args:
         text: the claim, followed by the number of trials that it needs.
         met: whether each trial meets it.
+        share: of the trials that must meet it.
         what: name of the trials.
-        numbers: further numbers of ours.
-        whole: what stands instead of "at least n" if all trials are needed.
+        numbers: added to the verdict.
+        whole: text instead of "at least n" if all trials are needed.
     """
-    least, count = math.ceil(share * len(met)), sum(met)
-    needed = whole if whole and least == len(met) else f"at least {least}"
-    here = ", ".join(filter(None, [f"{count} of {len(met)}", numbers]))
-    return Verdict(f"{text} {needed} of {len(met)} {what}", HOLDS if met and count >= least else FAILS, here)
+    needed, count, total = math.ceil(share * len(met)), sum(met), len(met)
+    amount = whole if whole and needed == total else f"at least {needed}"
+    here = ", ".join(filter(None, [f"{count} of {total}", numbers]))
+    return Verdict(f"{text} {amount} of {total} {what}", HOLDS if total and count >= needed else FAILS, here)
 
 
 def check(claims: Iterable[Claim], frame: Frame) -> list[Verdict]:

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from neuma_lib.evaluation.plotting import style
-from neuma_lib.mechanics.combinations import named_combinations
+from neuma_lib.paper.identified_table import true_values
 
 _BARS = 2  # standard deviations that error bars show
 _RATIOS = (0.01, 0.1, 0.3, 0.5, 0.7, 1, 1.5, 2, 3, 10, 100)  # ticks
@@ -39,12 +39,12 @@ def identified_page(identified: Mapping[str, Any], truth: Mapping[str, Mapping[s
     losses.margins(0.15)
     losses.set_yticks(range(len(order)), order)
     dropped = [name for name in identified["families"] if name not in scored]
-    title = f"dropped: {', '.join(dropped)}" if dropped else "all families"
+    title = f"pruned: {', '.join(dropped)}" if dropped else "all families"
     losses.set(xscale="log", xlabel="mean squared residual of held-out frames", title=title)
     losses.xaxis.set_minor_formatter(NullFormatter())
 
     quantities = identified["best"]["quantities"]
-    true = _true_values(truth) if truth else {}
+    true = true_values(truth or {})
     for place, (name, entry) in enumerate(reversed(quantities.items())):
         std = min(_BARS * entry["log_std"], _WIDEST * math.log(10))
         reach = [[1 - math.exp(-std)], [math.exp(std) - 1]]
@@ -54,7 +54,9 @@ def identified_page(identified: Mapping[str, Any], truth: Mapping[str, Mapping[s
             constants.plot([true[name] / entry["value"]], [place], "x", color=style.SEQUENCE[0], zorder=3)
     names = [f"{name} = {entry['value']:.3g}" for name, entry in quantities.items()]
     constants.set_yticks(range(len(names)), names[::-1])
-    constants.set(xscale="log", xlabel="over what was found\n(cross: truth, grey: not determined)")
+    constants.set(
+        xscale="log", xlabel="relative to the identified value\n(cross: truth, grey: not determined)"
+    )
     low, high = constants.get_xlim()
     ticks = [tick for tick in _RATIOS if low < tick < high]
     constants.set_xticks(ticks, [f"{tick:g}" for tick in ticks], minor=False)
@@ -63,9 +65,3 @@ def identified_page(identified: Mapping[str, Any], truth: Mapping[str, Mapping[s
     tied = f", tie with {', '.join(identified['ties'])}" if identified["ties"] else ""
     constants.set_title(identified["family"] + tied)
     return figure
-
-
-def _true_values(truth: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
-    """Constants of a true law and their combinations."""
-    values = {key: float(value) for part in truth.values() for key, value in part.items() if key != "name"}
-    return named_combinations(values) if {"E", "nu"} <= values.keys() else values

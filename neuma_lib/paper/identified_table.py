@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
@@ -20,85 +19,62 @@ CLOSE = 10.0
 SHARE = Fraction(4, 5)
 """Claimed share of right families, of errors within `WITHIN` and of errors within `CLOSE`."""
 RIGHT, TIE, WRONG = "right", "tie", "wrong"
+COLUMNS = "quantity value truth error_percent log_std error_in_std determined".split()
+"""Columns of a quantity in the CSV."""
 
 RULE = (
     "A family is right if it is the one that the truth was simulated with, or ties with it. Constants, moduli and "
-    "ratios of the identified family count that the truth has too; *determined* are those whose standard deviation the "
-    "identification gives as less than `identify.determined`. A claim *holds* if the count is reached, else it *does "
-    "not hold*; several replicates of a scene are not independent."
+    "ratios of the identified family count that the truth has too. *Determined* are those with an estimated standard "
+    "deviation below `identify.determined`. A claim *holds* if the count is reached, else it *does not hold*. Several "
+    "replicates of a scene are not independent."
 )
 """Explanation of the verdicts for readers of the table."""
 
 
-@dataclass(frozen=True)
-class Quantity:
-    """A constant or combination.
-
-    Attributes:
-        name: as in `named_combinations`.
-        value, truth: in SI units and degrees.
-        log_std: estimated standard deviation of the logarithm.
-        determined: whether the identification counts it as determined.
-    """
-
-    name: str
-    value: float
-    truth: float
-    log_std: float
-    determined: bool
-
-    @property
-    def error(self) -> float:
-        """Relative error [%]."""
-        return 100 * (self.value / self.truth - 1)
-
-    @property
-    def in_std(self) -> float:
-        """Error of the logarithm in estimated standard deviations."""
-        return math.log(self.value / self.truth) / self.log_std
+def true_values(truth: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
+    """Constants of a law and their combinations, from its specification."""
+    values = {key: float(value) for part in truth.values() for key, value in part.items() if key != "name"}
+    return named_combinations(values) if {"E", "nu"} <= values.keys() else values
 
 
-@dataclass(frozen=True)
-class IdentifiedScene:
-    """Identified material of a scene, in one replicate.
+def compare_family(identified: Mapping[str, Any], truth: Mapping[str, Mapping[str, Any]]) -> str:
+    """`RIGHT`, `TIE` (the right family predicts equally well) or `WRONG`.
 
-    Attributes:
-        name: of the scene's folder.
-        group: scenes that claims count together.
+    Args:
         identified: content of identified.json.
         truth: specification of the true law.
     """
-
-    name: str
-    group: str
-    identified: Mapping[str, Any]
-    truth: Mapping[str, Mapping[str, Any]]
-
-    @property
-    def family_is(self) -> str:
-        """`RIGHT`, `TIE` (the right family predicts equally well) or `WRONG`."""
-        true = _kind(self.truth)
-        if _kind(self.identified["law"]) == true:
-            return RIGHT
-        ties = (_kind(self.identified["families"][name]["law"]) for name in self.identified["ties"])
-        return TIE if true in ties else WRONG
-
-    @property
-    def quantities(self) -> list[Quantity]:
-        """Quantities that the true law has too."""
-        constants = {
-            key: float(value) for part in self.truth.values() for key, value in part.items() if key != "name"
-        }
-        true = named_combinations(constants)
-        return [
-            Quantity(name, entry["value"], true[name], entry["log_std"], entry["determined"])
-            for name, entry in self.identified["best"]["quantities"].items()
-            if true.get(name, 0) > 0 and entry["value"] > 0
-        ]
+    true = _kind(truth)
+    if _kind(identified["law"]) == true:
+        return RIGHT
+    return (
+        TIE if true in (_kind(identified["families"][name]["law"]) for name in identified["ties"]) else WRONG
+    )
 
 
-def identified_table(scenes: Sequence[IdentifiedScene]) -> tuple[str, str]:
+def compare_quantities(identified: Mapping[str, Any], truth: Mapping[str, Mapping[str, Any]]) -> list[dict]:
+    """Quantities that the true law has too, as `COLUMNS`. Values are in SI units and degrees, stds of logarithms.
+
+    Args:
+        identified: content of identified.json.
+        truth: specification of the true law.
+    """
+    true, rows = true_values(truth), []
+    for name, entry in identified["best"]["quantities"].items():
+        value, right, std = entry["value"], true.get(name, 0), entry["log_std"]
+        if right > 0 and value > 0:
+            ratio = value / right
+            cells = name, value, right, 100 * (ratio - 1), std, math.log(ratio) / std, entry["determined"]
+            rows.append(dict(zip(COLUMNS, cells)))
+    return rows
+
+
+def identified_table(scenes: Sequence[Mapping[str, Any]]) -> tuple[str, str]:
     """CSV with a row for each quantity, and Markdown with a row for each scene and verdicts for each group.
+
+    Args:
+        scenes: ``name``, ``group`` of the scenes that claims count together, ``identified``, the content of
+            identified.json, and ``truth``, the specification of the true law, for each scene and replicate.
 
     Raises:
         InputError: there are no scenes.
@@ -107,31 +83,30 @@ def identified_table(scenes: Sequence[IdentifiedScene]) -> tuple[str, str]:
         raise InputError(
             "tables.table1", "no scene has been identified", "Name scenes there, or set random.count"
         )
-    header = (
-        "scene family family_is quantity value truth error_percent log_std error_in_std determined".split()
-    )
-    rows = [
-        [
-            *(s.name, s.identified["family"], s.family_is),
-            *(q.name, q.value, q.truth, q.error, q.log_std, q.in_std, q.determined),
-        ]
-        for s in scenes
-        for q in s.quantities
-    ]
+    rows, groups = [], {}
+    for scene in scenes:
+        identified, laws = scene["identified"], (scene["identified"], scene["truth"])
+        verdict, quantities = compare_family(*laws), compare_quantities(*laws)
+        rows += [[scene["name"], identified["family"], verdict, *row.values()] for row in quantities]
+        tied = f", as good: {', '.join(identified['ties'])}" if identified["ties"] else ""
+        listed = [_listed(quantities, determined) for determined in (True, False)]
+        cells = [scene["name"], f"{identified['family']} ({verdict}{tied})", *listed]
+        groups.setdefault(scene["group"], []).append((cells, verdict, quantities))
     text = [
         "# Identified materials",
         "",
-        "Error of each quantity, and in brackets in estimated standard deviations.",
+        "Errors of quantities. In brackets: in estimated standard deviations.",
     ]
     verdicts = []
-    for group in dict.fromkeys(scene.group for scene in scenes):
-        members = [scene for scene in scenes if scene.group == group]
-        lines = [[s.name, _family(s), _list(s, True), _list(s, False)] for s in members]
+    for group, members in groups.items():
+        lines, families, quantities = zip(*members)
         heads = ["scene", "family", "determined", "not determined"]
         text += ["", f"**{group}**", "", *as_markdown(heads, lines)]
-        verdicts += _verdicts(members, group)
+        verdicts += _verdicts(
+            group, families, [row for rows in quantities for row in rows if row["determined"]]
+        )
     text += ["", *verdict_lines(verdicts), RULE, ""]
-    return as_csv([header, *rows]), "\n".join(text)
+    return as_csv([["scene", "family", "family_is", *COLUMNS], *rows]), "\n".join(text)
 
 
 def _kind(spec: Mapping[str, Mapping[str, Any]]) -> tuple[str, str, bool]:
@@ -141,22 +116,17 @@ def _kind(spec: Mapping[str, Mapping[str, Any]]) -> tuple[str, str, bool]:
     return spec["elasticity"]["name"], plasticity["name"], yields
 
 
-def _family(scene: IdentifiedScene) -> str:
-    ties = scene.identified["ties"]
-    tied = f", as good: {', '.join(ties)}" if ties else ""
-    return f"{scene.identified['family']} ({scene.family_is}{tied})"
+def _listed(quantities: Sequence[Mapping], determined: bool) -> str:
+    chosen = [q for q in quantities if q["determined"] == determined]
+    return ", ".join(
+        f"{q['quantity']} {q['error_percent']:+.0f} % ({q['error_in_std']:+.1f})" for q in chosen
+    )
 
 
-def _list(scene: IdentifiedScene, determined: bool) -> str:
-    chosen = [q for q in scene.quantities if q.determined == determined]
-    return ", ".join(f"{q.name} {q.error:+.0f} % ({q.in_std:+.1f})" for q in chosen)
-
-
-def _verdicts(scenes: Sequence[IdentifiedScene], group: str) -> list[Verdict]:
-    sure = [q for scene in scenes for q in scene.quantities if q.determined]
-    stds, errors = [abs(q.in_std) for q in sure], [abs(q.error) for q in sure]
+def _verdicts(group: str, families: Sequence[str], determined: Sequence[Mapping]) -> list[Verdict]:
+    stds, errors = ([abs(row[key]) for row in determined] for key in ("error_in_std", "error_percent"))
     claims = [
-        ("the family is right, or ties with the right one,", [s.family_is != WRONG for s in scenes], "scenes", ""),
+        ("the family is right, or ties with the right one,", [family != WRONG for family in families], "scenes", ""),
         (
             f"the truth lies within {WITHIN:g} estimated standard deviations",
             [std <= WITHIN for std in stds],

@@ -9,7 +9,7 @@ import numpy as np
 from neuma_lib.evaluation.response import inside
 from neuma_lib.evaluation.stress import PARTS
 from neuma_lib.evaluation.text_tables import as_csv, as_markdown
-from neuma_lib.paper.claims import Frame, Verdict, check, number, verdict_lines
+from neuma_lib.paper.claims import Frame, Verdict, check, number, spread_note, verdict_lines
 from neuma_lib.paper.published import OUTSIDE, PaperTable
 
 HEADINGS = PARTS | {"asymmetric": "Antisymmetric part of the stress, which no material has"}
@@ -38,26 +38,21 @@ def stress_table(
     Returns:
         CSV, with a row ``<part>_std`` after each row of means of several replicates; Markdown; verdicts on the claims.
     """
-    repeats = min(len(runs) for row in errors.values() for runs in row.values())
+    replicates = min(len(runs) for row in errors.values() for runs in row.values())
     frame = Frame(dict(columns))
     for part in HEADINGS:
         for method, title in titles.items():
-            runs = [[errors[method][c][k][part] for c in columns] for k in range(repeats)]
-            frame.add(
-                part, method, title, 100 * np.array(runs, dtype=float)
-            )  # None, of broken paths, becomes NaN
+            runs = [[errors[method][c][k][part] for c in columns] for k in range(replicates)]
+            # None, of broken paths, becomes NaN.
+            frame.add(part, method, title, 100 * np.array(runs, dtype=float))
     for method, row in (responses or {}).items():
-        replicates = list(zip(*(row[column] for column in columns), strict=True))
-        if all("band" in test for runs in replicates for tests in runs for test in tests.values()):
-            frame.add(
-                OUTSIDE, method, titles[method], [[_outside(tests) for tests in runs] for runs in replicates]
-            )
+        runs = list(zip(*(row[column] for column in columns), strict=True))
+        if all("band" in test for of_run in runs for tests in of_run for test in tests.values()):
+            frame.add(OUTSIDE, method, titles[method], [list(map(_outside, of_run)) for of_run in runs])
     verdicts = check(paper.claims, frame)
     lines = [["quantity", "method", "title", *columns, "Average"]]
-    about = (
-        "Errors in per cent of the true stress, root mean squares over states that the true law goes through"
-    )
-    text = [f"# {paper.heading}", "", f"{about} on the reconstruction.", ""]
+    about = "Errors in per cent of the true stress, root mean squares over the true law's states on the reconstruction."
+    text = [f"# {paper.heading}", "", about, ""]
     for part, heading in (HEADINGS | ({OUTSIDE: OUTSIDE_HEADING} if frame.of(OUTSIDE) else {})).items():
         lines += [cells for row in frame.of(part) for cells in row.csv_rows()]
         cells = [[row.title, *row.cells(1, number)] for row in frame.of(part)]
@@ -68,11 +63,8 @@ def stress_table(
             cells.append(["*true stress, root mean square [kPa]*", *scaled, ""])
         header = ["Method", *columns.values(), "Average"]
         text += [f"**{heading}**", "", *as_markdown(header, cells, numbers=True), ""]
-    if repeats > 1:
-        text += [
-            f"± is the standard deviation over {repeats} replicates; behind an average, of their averages.",
-            "",
-        ]
+    if note := spread_note(replicates):
+        text += [note, ""]
     broken = [
         f"- {titles[method]} on {columns[column]}: its stress became non-finite on {run['broken_paths']} paths, which "
         "are left out."

@@ -1,6 +1,6 @@
 """Tables of errors as CSV and Markdown, with the paper's numbers and verdicts on claims.
 
-The tracer RMSE comes first and decides. The Chamfer distance, the paper's measure, comes second with its sampling floor
+Claims are checked with the tracer RMSE. The Chamfer distance, the paper's measure, is listed with its sampling floor
 (`neuma_lib.evaluation.motion` explains its limits).
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import product
 
 import numpy as np
 
@@ -25,6 +26,7 @@ from neuma_lib.paper.claims import (
     Verdict,
     check,
     shown,
+    spread_note,
     verdict_lines,
 )
 from neuma_lib.paper.published import BALL_FLOOR, PaperTable
@@ -44,9 +46,9 @@ REFERENCES = (TRUE_LAW,)
 
 TRAINING_DIVERGED, ROLLOUT_DIVERGED = "†", "‡"
 FOOTNOTES = {
-    TRAINING_DIVERGED: "The training diverged; its best state is shown.",
-    ROLLOUT_DIVERGED: "A predicted motion broke off; its later frames hold the last sound state, from which the error "
-    "is too small. Averages with it are marked too.",
+    TRAINING_DIVERGED: "The training diverged. Numbers are those of its best state.",
+    ROLLOUT_DIVERGED: "A prediction broke off. Its later frames repeat the last valid state, so its error is too "
+    "small. Averages with it are marked too.",
 }
 """Signs after numbers, and their meaning."""
 
@@ -95,10 +97,7 @@ class Table(Frame):
         """RMSE of all methods, their Chamfer distances with the paper's, footnotes, and verdicts on claims."""
         parts = [f"# {self.paper.heading}", ""] if self.paper else []
         parts += [*self._errors(), *self._distances()]
-        paragraphs = []
-        if repeats := max(len(row.runs) for row in self.rows.values()) - 1:
-            spread = f"± is the standard deviation over {repeats + 1} replicates; behind an average, of their averages."
-            paragraphs.append(spread)
+        paragraphs = [spread_note(max(len(row.runs) for row in self.rows.values()))]
         signs = "".join(self.marks.values())
         paragraphs += [f"{sign} {note}" for sign, note in FOOTNOTES.items() if sign in signs]
         if remarks := [*self.failures, *self.outliers()]:
@@ -129,7 +128,7 @@ class Table(Frame):
         """How much closer to the truth learned laws are than the true law itself. None if that has no row."""
         if (RMSE, TRUE_LAW) not in self.rows:
             return None
-        true = self.row(RMSE, TRUE_LAW).mean[:-1]
+        true = self.rows[RMSE, TRUE_LAW].mean[:-1]
         closer = []
         for row in self._competing():
             gain = true - row.mean[:-1]
@@ -139,16 +138,11 @@ class Table(Frame):
                     f"{row.title} in {where.sum()} of {len(where)} columns (there by {gain[where].mean():.1f} of "
                     f"{true[where].mean():.1f} mm on average)"
                 )
+        gains = f"Closer to the truth than it: {'; '.join(closer)}." if closer else "None is closer than it."
         return (
-            f"{ABSORBED}, shows what error remains when the law is right: that of start, particles, grid and time "
-            "step. "
-            + (
-                f"Closer to the truth than it: {'; '.join(closer)}. "
-                if closer
-                else "None is closer than it. "
-            )
-            + "What a law gains over the true one is no knowledge of the material: it has absorbed discretisation, or "
-            "errors of the start."
+            f"{ABSORBED}, shows the error that remains with the right law: that of start, particles, grid and time "
+            f"step. {gains} Lower errors than those of the true law are no knowledge of the material: the law has "
+            "absorbed discretisation, or errors of the start."
         )
 
     def _competing(self) -> list[Row]:
@@ -161,14 +155,14 @@ class Table(Frame):
         others = ("tracer_error_p95_mm", "tracer_rmse_last_mm")
         for row in self.of(RMSE):
             values = [row.median] if several else []
-            values += [self.row(name, row.method).mean[-1] for name in others]
+            values += [self.rows[name, row.method].mean[-1] for name in others]
             best = f"{wins[row.method]} of {len(self.columns)}" if row.method in wins else ""
             cells = [shown(value, 1) + self._average_mark(row) for value in values]
             rows.append([*self._cells(row, 1), *cells, *([best] if compared else [])])
         heads = ["Average", *(["Median"] if several else []), *(QUANTITIES[name] for name in others)]
-        note = "95 %: the distance that 95 % of all tracers, over all frames, stay below. Last frame: the RMSE in it."
+        note = "95 %: the 95th percentile of the distances of all tracers in all frames. Last frame: the RMSE in it."
         if several:
-            note += " Both are averages over the columns; the median is that of all runs of a row."
+            note += " Both are averages over the columns. The median is that of all runs of a row."
         if compared:
             heads.append("Best in")
             note += " Best in: columns in which a row has the lowest mean."
@@ -179,7 +173,7 @@ class Table(Frame):
         rows = []
         note = (
             "The floor is the distance between two random sets of as many tracers with the true motion. The distance "
-            "compares shapes only, so small errors of the motion hardly change it."
+            "compares shapes only, so small errors of the motion have little effect on it."
         )
         printed = {row.method: row.mean for row in self.of(PRINTED) if np.isfinite(row.mean[-1])}
         for row in self.of("chamfer"):
@@ -189,8 +183,8 @@ class Table(Frame):
         rows += [self._cells(row, 2) for row in self.of(FLOOR)]
         if printed:
             note += (
-                f" The paper's numbers ({self.paper.label}) are of materials that it does not publish, and contain "
-                "another floor, set by its particles."
+                f" The paper's numbers ({self.paper.label}) are for unpublished materials, and contain another floor, "
+                "that of its particles."
             )
             note += f" {BALL_FLOOR}" if "BouncyBall" in self.columns else ""
         return self._section("chamfer", ["Average"], rows, note)
@@ -242,24 +236,22 @@ def chamfer_table(
         )
     table = Table(dict(columns), paper=paper, notes=notes or {}, note=note)
 
-    def add(quantity: str, method: str, title: str, name: str) -> None:
-        if missing := next((column for column in columns if not metrics.get(method, {}).get(column)), None):
-            raise InputError(
-                "tables", f"no metrics.json of {method} on {missing}", "Compute it, or remove the method"
-            )
+    def values(quantity: str, method: str) -> list[list[float]]:
         count = min(len(metrics[method][column]) for column in columns)
-        runs = [[_value(quantity, method, c, metrics[method][c][k]) for c in columns] for k in range(count)]
-        table.add(quantity, name, title, runs[:1] if quantity == FLOOR else runs)
+        return [[_value(quantity, method, c, metrics[method][c][k]) for c in columns] for k in range(count)]
 
-    for quantity in (*QUANTITIES, BROKEN):
-        for method, title in titles.items():
-            add(quantity, method, title, method)
-    add(FLOOR, next(iter(titles)), "Sampling floor", "floor")
-    for method in titles:
+    for method, column in product(titles, columns):
+        if not metrics.get(method, {}).get(column):
+            raise InputError(
+                "tables", f"no metrics.json of {method} on {column}", "Compute it, or remove the method"
+            )
+    for quantity, method in product((*QUANTITIES, BROKEN), titles):
+        table.add(quantity, method, titles[method], values(quantity, method))
+    table.add(FLOOR, "floor", "Sampling floor", values(FLOOR, next(iter(titles)))[:1])
+    for method, title in titles.items():
         if paper and method in paper.rows:
             known = dict(zip(paper.columns, paper.rows[method], strict=True))
             table.add(PRINTED, method, "*paper*", [[known.get(column, math.nan) for column in columns]])
-    for method, title in titles.items():
         for column, heading in columns.items():
             runs = metrics[method][column]
             signs = TRAINING_DIVERGED if any(run.get("stable") is False for run in runs) else ""
@@ -276,11 +268,11 @@ def chamfer_table(
 def _describe_failure(run: Mapping) -> str:
     """What happened in a prediction that stopped early, and when it began to gain energy."""
     failure, gain = run["diverged"], run["energy_gain_after_step"]
-    began = f"it had more energy than at the start after step {gain}"
+    energy = f"energy exceeded that of the start after step {gain}"
     if gain is None:
-        began = "no frame before had more energy than the start"
+        energy = "energy did not exceed that of the start before"
     what = f"particle {failure['particle']} {failure['happened']} at step {failure['step']} of {run['frames'][-1]}"
-    return f"{what}; {began}."
+    return f"{what}; {energy}."
 
 
 def _value(quantity: str, method: str, column: str, run: Mapping) -> float:

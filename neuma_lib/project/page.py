@@ -69,7 +69,8 @@ def settings_schema() -> str:
 
 
 def _without_internal_keys(schema: Any) -> Any:
-    """A schema without internal keys, titles, and lists of required keys, since files complete each other."""
+    """A schema without internal keys, titles, lists of required keys, since files complete each other, and defaults of
+    the format that only some versions of pydantic write."""
     if isinstance(schema, list):
         return [_without_internal_keys(part) for part in schema]
     if not isinstance(schema, dict):
@@ -83,7 +84,7 @@ def _without_internal_keys(schema: Any) -> Any:
             result[key] = {name: _without_internal_keys(entry) for name, entry in value.items()}
         elif key == "default":
             result[key] = value
-        elif key not in ("title", "required"):
+        elif key not in ("title", "required") and (key, value) != ("additionalProperties", True):
             result[key] = _without_internal_keys(value)
     return result
 

@@ -7,6 +7,7 @@ box (`LiveSimulation.floor`).
 
 from __future__ import annotations
 
+import functools
 import queue
 import threading
 import time
@@ -107,6 +108,20 @@ def tilted(about_x: float, about_z: float) -> np.ndarray:
     return z @ x
 
 
+def _queued(command: Callable[..., None]) -> Callable[..., None]:
+    """Decorate a method to be executed by the simulation's thread between two frames."""
+
+    @functools.wraps(command)
+    def enqueue(self: LiveSimulation, *args) -> None:
+        def run() -> None:
+            self._notice = None
+            command(self, *args)
+
+        self._commands.put(run)
+
+    return enqueue
+
+
 class LiveSimulation:
     """Bodies in the box, simulated by a thread.
 
@@ -166,48 +181,89 @@ class LiveSimulation:
         except queue.Empty:
             return self._snapshot
 
+    @_queued
     def reset(self) -> None:
         """Restore the initial state of the first body alone. Gravity, floor, law and weight stay as set."""
-        self._enqueue(self._restart)
+        self._restart()
 
+    @_queued
     def run(self, running: bool) -> None:
         """Continue or pause."""
-        self._enqueue(lambda: setattr(self, "_running", running))
+        self._running = running
 
+    @_queued
     def set_gravity(self, strength: float) -> None:
         """Set the gravity, downwards in the room [m/s^2]."""
-        self._enqueue(lambda: setattr(self, "_strength", float(strength)))
+        self._strength = float(strength)
 
+    @_queued
     def set_floor(self, about_x: float, about_z: float) -> None:
         """Tilt the box about two axes [degrees]."""
-        self._enqueue(lambda: setattr(self, "floor", tilted(about_x, about_z)))
+        self.floor = tilted(about_x, about_z)
 
+    @_queued
     def set_weight(self, weight: float) -> None:
         """Set the weight of the adaptors: 0 is the prior, 1 as trained. Has no effect on laws without one."""
-        self._enqueue(lambda: self._set_weight(weight))
+        self._weight = float(weight)
+        self._apply_weight()
 
+    @_queued
     def set_law(self, law: Law, dt: float) -> None:
         """Change the law of the first body; ``dt`` is the time step of its training [s].
 
         Rejected with a notice if other bodies cannot use that step (`_check_steps`).
         """
-        self._enqueue(lambda: self._set_law(law, dt))
+        _check_steps([law, *self._laws[1:]], [dt, *self._dts[1:]])
+        self._first_law, self._first_dt = law, dt
+        self._laws[0], self._dts[0] = law, dt
+        self._apply_weight()
 
+    @_queued
     def launch(self, velocity: Sequence[float]) -> None:
         """Set a uniform velocity of the first body [m/s], in the room's axes."""
-        self._enqueue(lambda: self._launch(velocity))
+        self._hand = None
+        self._set_velocity(self.to_box(velocity))
 
+    @_queued
     def drop(self, height: float) -> None:
         """Move the first body, undeformed and at rest, to a height above the floor [m]."""
-        self._enqueue(lambda: self._lift(height))
+        if not np.isfinite(height):
+            raise InputError("height", "is not a number")
+        start, own = self._start, self._first()
+        low, high = (float(end) for end in torch.aminmax(start.x[:, 1]))
+        highest = 1 - _GAP * self.model.dx - (high - low)
+        lifted = start.x.clone()
+        lifted[:, 1] += min(max(height, 0.0), max(highest, 0.0)) - low
+        state, rest = self._state, _undeformed(lifted)
+        old = (state.x, state.v.expand_as(state.x), state.F, state.C, self._total)
+        x, v, F, C, total = (array.clone() for array in old)
+        x[own], v[own], F[own], C[own], total[own] = lifted, 0.0, rest, 0.0, rest
+        self._state, self._total, self._hand = replace(state, x=x, v=v, F=F, C=C), total, None
+        if len(self._counts) == 1:
+            self._trouble = None  # the diverged state is gone
 
+    @_queued
     def hold(self, place: Sequence[float] | None) -> None:
         """Pull the centre of the first body to a point [m], in the room's axes; None releases it."""
-        self._enqueue(lambda: setattr(self, "_hand", None if place is None else np.array(place, float)))
+        self._hand = None if place is None else np.array(place, float)
 
+    @_queued
     def add(self, body: State, law: Law, dt: float) -> None:
         """Add a body at rest above all others. Rejected with a notice if there is no space or no common time step."""
-        self._enqueue(lambda: self._add(body, law, dt))
+        _check_steps([*self._laws, law], [*self._dts, dt])
+        gap = _GAP * self.model.dx
+        low, high = body.x.amin(dim=0), body.x.amax(dim=0)
+        floor = float(self._state.x[:, 1].max()) + gap
+        if floor + float(high[1] - low[1]) > 1 - gap:
+            raise InputError("add", "there is no room above the other bodies", "Reset, or wait")
+        shift = 0.5 - 0.5 * (low + high)
+        shift[1] = floor - low[1]
+        added = replace(body, x=body.x + shift, v=torch.zeros_like(body.x), F=None, C=None)
+        self._state = State.joined([self._state, added])
+        self._total = torch.cat([self._total, _undeformed(body.x)])
+        self._counts, self._laws = [*self._counts, len(body.x)], [*self._laws, law]
+        self._dts = [*self._dts, dt]
+        self._apply_weight()
 
     def to_box(self, vector: Sequence[float]) -> np.ndarray:
         """A direction of the room in the axes of the box."""
@@ -216,13 +272,6 @@ class LiveSimulation:
     def place_in_box(self, place: Sequence[float]) -> np.ndarray:
         """A point of the room in the coordinates of the box, which is rotated about `PIVOT`."""
         return self.to_box(np.asarray(place, float) - PIVOT) + PIVOT
-
-    def _enqueue(self, command: Callable[[], None]) -> None:
-        def run() -> None:
-            self._notice = None
-            command()
-
-        self._commands.put(run)
 
     # ---- in the thread -----------------------------------------------------------------------------------------------
 
@@ -323,18 +372,11 @@ class LiveSimulation:
         self._hand = self._trouble = None
         self._publish()
 
-    def _set_weight(self, weight: float) -> None:
-        self._weight = float(weight)
+    def _apply_weight(self) -> None:
         for law in self._laws:
             adapted = isinstance(law, AdaptableLaw) and all(part.adaptor for part in law.parts.values())
             if adapted and law.parts:
                 law.set_adaptor_weight(self._weight)
-
-    def _set_law(self, law: Law, dt: float) -> None:
-        _check_steps([law, *self._laws[1:]], [dt, *self._dts[1:]])
-        self._first_law, self._first_dt = law, dt
-        self._laws[0], self._dts[0] = law, dt
-        self._set_weight(self._weight)
 
     def _first(self) -> slice:
         return slice(0, self._counts[0])
@@ -349,50 +391,9 @@ class LiveSimulation:
         v[own], C[own] = torch.from_numpy(velocity).to(v), 0.0
         self._state = replace(state, v=v, C=C)
 
-    def _launch(self, velocity: Sequence[float]) -> None:
-        self._hand = None
-        self._set_velocity(self.to_box(velocity))
-
     def _follow_hand(self, span: float) -> None:
         model, x = self.model, self._state.x[self._first()]
         centre, half = x.mean(dim=0), 0.5 * (x.amax(dim=0) - x.amin(dim=0))
         margin = _GAP * model.dx + half.double().cpu().numpy()
         target = np.clip(self.place_in_box(self._hand), np.minimum(margin, 0.5), np.maximum(1 - margin, 0.5))
         self._set_velocity((target - centre.double().cpu().numpy()) / max(_HAND, span))
-
-    def _lift(self, height: float) -> None:
-        start, own = self._start, self._first()
-        if not np.isfinite(height):
-            raise InputError("height", "is not a number")
-        low, high = (float(end) for end in torch.aminmax(start.x[:, 1]))
-        highest = 1 - _GAP * self.model.dx - (high - low)
-        lifted = start.x.clone()
-        lifted[:, 1] += min(max(height, 0.0), max(highest, 0.0)) - low
-        values = {name: getattr(self._state, name).clone() for name in ("x", "F", "C")}
-        v = self._state.v.expand_as(self._state.x).clone()
-        rest = _undeformed(lifted)
-        values["x"][own], v[own], values["F"][own], values["C"][own] = lifted, 0.0, rest, 0.0
-        total = self._total.clone()
-        total[own] = rest
-        self._state, self._total, self._hand = replace(self._state, v=v, **values), total, None
-        if len(self._counts) == 1:
-            self._trouble = None  # the diverged state is gone
-
-    def _add(self, body: State, law: Law, dt: float) -> None:
-        _check_steps([*self._laws, law], [*self._dts, dt])
-        gap = _GAP * self.model.dx
-        low, high = body.x.amin(dim=0), body.x.amax(dim=0)
-        floor = float(self._state.x[:, 1].max()) + gap
-        if floor + float(high[1] - low[1]) > 1 - gap:
-            raise InputError("add", "there is no room above the other bodies", "Reset, or wait")
-        shift = 0.5 - 0.5 * (low + high)
-        shift[1] = floor - low[1]
-        added = replace(body, x=body.x + shift, v=torch.zeros_like(body.x), F=None, C=None)
-        self._state = State.joined([self._state, added])
-        self._total = torch.cat([self._total, _undeformed(body.x)])
-        self._counts, self._laws, self._dts = (
-            [*self._counts, len(body.x)],
-            [*self._laws, law],
-            [*self._dts, dt],
-        )
-        self._set_weight(self._weight)

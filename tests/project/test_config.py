@@ -391,9 +391,11 @@ def test_every_section_and_key_is_explained():
         assert kind.__doc__ and all(entry.description for entry in kind.model_fields.values()), kind.__name__
 
 
-@pytest.mark.parametrize(("file", "text"), [(PAGE, settings_markdown), (SCHEMA, settings_schema)])
-def test_page_and_schema_are_up_to_date(file, text):
-    assert (ROOT / file).read_text() == text(), "run: python -m neuma_lib.project.page"
+def test_page_and_schema_are_up_to_date():
+    """Versions of pydantic write bounds of numbers as 0 or 0.0, so that the values of the schema are compared."""
+    assert (ROOT / PAGE).read_text() == settings_markdown(), "run: python -m neuma_lib.project.page"
+    schema = json.loads((ROOT / SCHEMA).read_text())
+    assert schema == json.loads(settings_schema()), "run: python -m neuma_lib.project.page"
 
 
 def test_page_and_schema_have_public_keys_alone():

@@ -1,9 +1,9 @@
 """Results of random scenes."""
 
-from neuma_lib.paper.random_scenes import RandomScene
+from tests.support.table_results import run
 
 
-def result(name, prior, scored, true=3.0, failed=None, depth=0.1, plane=1.0):
+def result(name, prior, scored, true=3.0, failed=(), depth=0.1, plane=1.0):
     start = {
         "velocity_error_in_plane_percent": plane,
         "velocity_error_depth": depth,
@@ -14,7 +14,8 @@ def result(name, prior, scored, true=3.0, failed=None, depth=0.1, plane=1.0):
         "angular_velocity_error_percent": 8.0,
     }
     rmse = {"nclaw": prior, "neuma": scored, "true_law": true}
-    return RandomScene(name, "ball", "hencky", "jelly", rmse, failed or {}, start)
+    metrics = {method: run(value, stable=method not in failed) for method, value in rmse.items()}
+    return {"name": name, "family": "hencky", "prior": "jelly", "metrics": metrics, "start": start}
 
 
 METHODS = {"nclaw": "NCLaw", "neuma": "NeuMA", "true_law": "True law"}

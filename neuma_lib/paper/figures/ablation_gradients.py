@@ -1,5 +1,5 @@
-"""Choices that the paper leaves open, on three scenes: image gradients through means and covariances (NeuMA) or through
-means only (as in the authors' released code); gradients zeroed before every iteration or accumulated (as in the
+"""Alternatives that the paper leaves open, on three scenes: image gradients through means and covariances (NeuMA) or
+through means only (as in the authors' released code); gradients zeroed before every iteration or accumulated (as in the
 released loop); covariances stretched by the elastic deformation (paper) or by the total one, plastic flow included. Not
 in the paper.
 """

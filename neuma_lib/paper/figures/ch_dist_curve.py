@@ -1,7 +1,7 @@
-"""Errors over time, all methods and scenes, measured on dense passive tracers. Above: root mean square distance of
-tracers that start alike in truth and prediction. Below: the paper's Chamfer distance between predicted and true body,
-which compares shapes only. Grey: below the sampling floor, the distance of two random sets of points of the truth.
-Before contact the motion is the same for every material. Paper: fig:ch_dist_curve (Chamfer distances).
+"""Errors over time of all methods and scenes, measured with dense passive tracers. Above: root mean square distance of
+tracers with the same start in truth and prediction. Below: the paper's Chamfer distance between predicted and true
+body, which compares shapes only. Grey: below the sampling floor, the distance between two random samples of the true
+body. Before contact, the motion does not depend on the material. Paper: fig:ch_dist_curve (Chamfer distances).
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Prediction three times as long as the video: particles of the truth, renders of the prior and of trained laws, and
-the mean height of the body over time. Grey: the part that was observed. Paper: fig:ext_time.
+"""Prediction three times as long as the video: particles of the truth, renders with the prior and with trained laws,
+and the mean height of the body over time. Grey: the observed part. Paper: fig:ext_time.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ def data(inputs, params, log) -> ImageGrid:
     names = ("x", "mass", "vol0", "frames")
     truth, attributes = read_arrays(inputs.truth, required=names, only=names)
     body = load_reconstruction(inputs.particles, inputs.binding, inputs.gaussians, params.density)
-    chosen = rendering.evenly(params.shown, len(truth["frames"]))
+    picked = rendering.evenly(params.shown, len(truth["frames"]))
     motions = [load_motion(file) for file in inputs.rollouts]
     everywhere = [np.asarray(x).reshape(-1, 3) for x in (truth["x"], *(x for x, _ in motions))]
     cameras = rendering.frontal(np.concatenate(everywhere), params.size, params.size)
     rows = [
         rendering.particle_pictures(
-            truth["x"][chosen], style.TRUE_PARTICLES, rendering.sphere_radius(truth["vol0"]), cameras
+            truth["x"][picked], style.TRUE_PARTICLES, rendering.sphere_radius(truth["vol0"]), cameras
         )
     ]
     heights = {"truth": mean_height(truth["x"], truth["mass"])}
     for method, (x, F) in zip(params.titles, motions, strict=True):
-        rows.append(rendering.renders(body, cameras, x[chosen], F[chosen]))
+        rows.append(rendering.renders(body, cameras, x[picked], F[picked]))
         heights[method] = mean_height(x, body.mass)
     dt = attributes["dt"]
     numbers = {
@@ -48,7 +48,7 @@ def data(inputs, params, log) -> ImageGrid:
     for method in params.titles:
         far = max(abs(a - b) for a, b in zip(heights["truth"], heights[method], strict=True))
         log(f"{method}: mean height within {1e3 * far:.1f} mm of the truth")
-    columns = tuple(rendering.milliseconds(truth["frames"][chosen], dt))
+    columns = tuple(rendering.milliseconds(truth["frames"][picked], dt))
     return ImageGrid(images, ("Truth (particles)", *params.titles.values()), columns, numbers)
 
 

@@ -1,6 +1,6 @@
 """Which law does training change? Norms of the loss gradient with respect to the adaptors of the elastic and of the
 plastic network over the iterations, their medians, and how far the merged weights moved from those of the prior. The
-titles name the wrong laws of the prior. Paper: fig:gradient_analysis.
+titles name the laws of the prior that are wrong. Paper: fig:gradient_analysis.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Splats that were made elsewhere, by an image-to-3D model or from photographs, under laws that were learned from
-videos of other objects: particles fill the surface that renders of the splat show, and carry its Gaussians. Left: the
-splat where it starts. Paper: fig:i23d.
+"""Splats from an image-to-3D model or from photographs, simulated with laws learned from videos of other objects.
+Particles fill the surface that renders of the splat show, and move its Gaussians. Left: the initial state. Paper:
+fig:i23d.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ def data(inputs, params, log) -> ImageGrid:
     paths = [read_arrays(file, required=("frames",), only=("frames",)) for file in inputs.rollouts]
     motions = []
     for file, (arrays, _) in zip(inputs.rollouts, paths, strict=True):
-        chosen = rendering.evenly(params.shown, len(arrays["frames"]))
-        motions.append([torch.as_tensor(state[chosen]) for state in load_motion(file)])
+        picked = rendering.evenly(params.shown, len(arrays["frames"]))
+        motions.append([torch.as_tensor(state[picked]) for state in load_motion(file)])
     around = [rendering.seen_around(bodies[k // laws], *motion) for k, motion in enumerate(motions)]
     clouds = [np.concatenate(around[k : k + laws]) for k in range(0, len(around), laws)]
     width, height = rendering.picture_size(
@@ -41,9 +41,9 @@ def data(inputs, params, log) -> ImageGrid:
     pictures, times = [], []
     for k, (arrays, attributes) in enumerate(paths):
         body, cameras = bodies[k // laws], rendering.frontal(clouds[k // laws], width, height)
-        chosen = rendering.evenly(params.shown, len(arrays["frames"]))
+        picked = rendering.evenly(params.shown, len(arrays["frames"]))
         pictures.append(rendering.renders(body, cameras, *motions[k]))
-        times = times or rendering.milliseconds(arrays["frames"][chosen], attributes["dt"])
+        times = times or rendering.milliseconds(arrays["frames"][picked], attributes["dt"])
     diverged = [k for k, file in enumerate(inputs.reports) if read_json(file)["diverged"]]
     log(f"{len(splats)} splats under {laws} laws" + (f"; {len(diverged)} broke off" if diverged else ""))
     titles = [f"{splat}, {law}" for splat in splats for law in params.laws]

@@ -1,7 +1,7 @@
 """Quality of renders against the observation: PSNR, SSIM (higher is better) and LPIPS with the VGG and Alex networks
-(lower is better), averaged over all frames, on the bounding box of the object plus a margin, in views that training did
-not see; scenes without such a view, and methods that train on all views, are marked. Grey column: mean over the
-scenes. NCLaw is the prior rendered by Particle-GS (the paper's NCLaw+R); PAC-NeRF on its own particles is rendered as
+(lower is better), averaged over all frames, on the bounding box of the object plus a margin, in views not used for
+training. Labels mark scenes without such a view, and methods that train on all views. Grey column: mean over the
+scenes. NCLaw is the prior rendered by Particle-GS (the paper's NCLaw+R). PAC-NeRF on its own particles is rendered as
 its radiance field. Paper: fig:image_quality.
 """
 

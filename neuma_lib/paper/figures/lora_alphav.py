@@ -1,7 +1,6 @@
-"""Between prior and observation: the adaptor with weight w, from the prior (w = 0; of a structured law, its constants)
-to the trained law (w = 1) and a little beyond (dashed). Left: renders; right: mean height of the body over time, dots:
-the truth. A motion that becomes non-finite, which can happen beyond 1, is held at its last finite frame. Paper:
-fig:lora_alphav.
+"""Adaptor with weight w, from the prior (w = 0; for a structured law, its constants) to the trained law (w = 1) and
+slightly beyond (dashed). Left: renders. Right: mean height of the body over time, with the truth as dots. A motion that
+becomes non-finite, which can happen beyond 1, is held at its last finite frame. Paper: fig:lora_alphav.
 """
 
 from __future__ import annotations
@@ -43,22 +42,22 @@ def data(inputs, params, log) -> ImageGrid:
         law = load_law(inputs.prior[k] if inputs.prior else None, inputs.adaptor[k], model.dt).to(device)
         start = with_motion(body, inputs.start[k])
         truth, _ = read_arrays(inputs.truth[k], required=("x", "mass"), only=("x", "mass"))
-        chosen = rendering.evenly(params.shown, len(video.frames))[1:]  # the start is the same for all
+        picked = rendering.evenly(params.shown, len(video.frames))[1:]  # the start is the same for all
         columns, heights = [], []
         for weight in params.weights:
             law.set_adaptor_weight(weight)
             path, failure = predict(model, law, start, video.frames, total=params.total[scene])
-            columns.append(rendering.renders(body, cameras, path.x[chosen], path.stretch[chosen]))
+            columns.append(rendering.renders(body, cameras, path.x[picked], path.stretch[picked]))
             heights.append(mean_height(path.x.cpu(), body.mass.cpu()))
             if failure:
                 log(f"{scene}: w = {weight:g}: a particle {failure.happened} at step {failure.step}")
         monotone, parted = monotone_frames([heights[k] for k in inside])
         log(f"{scene}: between 0 and 1, height monotone in w in {monotone} of {parted} frames after contact")
-        columns.append(rendering.observed(video, chosen, params.magnify))
+        columns.append(rendering.observed(video, picked, params.magnify))
         blocks.append(np.stack(columns, axis=1))
-        rows += rendering.milliseconds([video.frames[i] for i in chosen], model.dt)
+        rows += rendering.milliseconds([video.frames[i] for i in picked], model.dt)
         scenes[scene] = {
-            "rows": len(chosen),
+            "rows": len(picked),
             "time": [model.dt * step for step in video.frames],
             "heights": heights,
             "truth": mean_height(truth["x"], truth["mass"]),
@@ -105,7 +104,7 @@ def draw(grid: ImageGrid) -> Figure:
         axes.grid(axis="y")
         if first == 0:
             spacing = {"columnspacing": 1.2, "handlelength": 1.6, "borderaxespad": 0.1}
-            chosen = axes.get_legend_handles_labels()
-            figure.legend(*chosen, loc="upper center", ncols=len(weights) + 1, **spacing)
+            entries = axes.get_legend_handles_labels()
+            figure.legend(*entries, loc="upper center", ncols=len(weights) + 1, **spacing)
         top, first = top + block, first + scene["rows"]
     return figure

@@ -1,5 +1,5 @@
-"""Renders over time: the observation, the prior (NCLaw), NeuMA and its ablations, at the same times
-and from the training view. Renders have a higher resolution than the video; those of PAC-NeRF on its own particles are
+"""Renders over time: the observation, the prior (NCLaw), NeuMA and its ablations, at the same times from the training
+view. Renders have a higher resolution than the video; those of PAC-NeRF on its own particles are
 of its radiance field. Paper: fig:main_res.
 """
 
@@ -22,16 +22,16 @@ def data(inputs, params, log) -> ImageGrid:
     rollouts = iter(inputs.rollouts)
     for k, (scene, setting) in enumerate(params.scenes.items()):
         video, body, cameras = rendering.film(inputs, params, k, setting["density"])
-        chosen = rendering.evenly(params.shown, len(video.frames))
-        rows = [rendering.observed(video, chosen, params.magnify)]
+        picked = rendering.evenly(params.shown, len(video.frames))
+        rows = [rendering.observed(video, picked, params.magnify)]
         for method in params.titles:
-            states = (state[chosen] for state in load_motion(next(rollouts)))
+            states = (state[picked] for state in load_motion(next(rollouts)))
             own = params.own.get(method, {}).get(scene)
             seen = own_body(own, setting["density"]) if own else body
             rows.append(rendering.renders(seen, cameras, *states))
         blocks.append(np.stack(rows))
-        times += rendering.milliseconds([video.frames[i] for i in chosen], setting["dt"])
-        groups.append((scene, len(chosen)))
+        times += rendering.milliseconds([video.frames[i] for i in picked], setting["dt"])
+        groups.append((scene, len(picked)))
     images = np.concatenate(rendering.cropped(blocks), axis=1)
     log(f"{images.shape[0]} x {images.shape[1]} pictures")
     return ImageGrid(images, ("Observation", *params.titles.values()), tuple(times), {"groups": groups})

@@ -1,14 +1,12 @@
-"""Tests of single material points: the response of the laws, without grid or body. Top: axial Kirchhoff stress of the
-elastic law over the axial stretch, the sides free of traction. Middle: shear stress of the elastic law over simple
-shear, compressed to the 5th percentile of the observed volume ratios J. Bottom: the same shear at a constant rate of
-20 per second with elastic law and return map step by step, as in the simulation: where the curve bends, the material
-yields or flows. Blue ground: the range of elastic stretches, shears and shear stresses that the true law goes through
-on the reconstruction (99 % of them). Ranges are marginal: not every combination inside them was visited. Coloured
-bands: 95 % of the laws that the video leaves possible, by the constants' covariance and, around a correction, a
-process that is as free as the correction where the video is silent; for laws without such an estimate, the range of
-their replicates, if there are several. The video determines motion, that is elastic law and return map together; where
-the two can trade places, each alone may differ from the truth. Laws far off are cut where they leave the panel. Not in
-the paper.
+"""Material point tests: responses of the laws without grid or body. Top: axial Kirchhoff stress of the elastic law over
+axial stretch, with traction-free sides. Middle: shear stress of the elastic law in simple shear, compressed to the 5th
+percentile of the observed volume ratios J. Bottom: the same shear at a constant rate of 20 per second, with elastic law
+and return map in every step; the curve bends where the material yields or flows. Blue: range of elastic stretches,
+shears and shear stresses of the true law on the reconstruction (99 % of them). Ranges are marginal, so not every
+combination inside them occurs. Coloured bands: 95 % of the laws that the video allows, from the covariance of the
+constants and, for corrections, a Gaussian process. Laws without a covariance have the range of their replicates. The
+video determines elastic law and return map together, so each alone may differ from the truth. Curves far from the truth
+are cut at the edge of the panel. Not in the paper.
 """
 
 from __future__ import annotations
@@ -17,12 +15,11 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 from neuma_lib.evaluation.bands import envelope
 from neuma_lib.evaluation.plotting import style
 from neuma_lib.evaluation.response import inside
-from neuma_lib.evaluation.stress_curves import VISITED
+from neuma_lib.evaluation.stress_curves import HEADROOM, draw_laws, draw_visited, set_limits
 from neuma_lib.io.files import read_json
 
 TESTS = {
@@ -30,8 +27,6 @@ TESTS = {
     "shear": ("elastic shear", "shear stress"),
     "yield": ("total shear", "shear stress"),
 }
-HEADROOM = 0.6
-"""Limit of the curves of compared laws beyond those of the truth, relative to the range of the truth."""
 
 
 def data(inputs, params, log) -> dict:
@@ -41,17 +36,14 @@ def data(inputs, params, log) -> dict:
     ``band``: None, or ``x``, ``low``, ``high``, and ``inside``, the share of visited points with the truth in it.
     """
     files = iter(inputs.responses)
-    runs = [
-        (*cell, [read_json(next(files)) for _ in range(replicates)]) for *cell, replicates in params.cells
-    ]
     scenes: dict = {}
-    for scene, method, replicates in runs:
+    for scene, method, count in params.cells:
+        replicates = [read_json(next(files)) for _ in range(count)]
         for test in TESTS:
-            of_test = [replicate[test] for replicate in replicates]
-            first = of_test[0]
-            shared = {key: first[key] for key in ("x", "visited", "by_stress", "true")}
+            runs = [replicate[test] for replicate in replicates]
+            shared = {key: runs[0][key] for key in ("x", "visited", "by_stress", "true")}
             entry = scenes.setdefault(scene, {}).setdefault(test, {**shared, "laws": {}})
-            entry["laws"][method] = {"stress": first["stress"], "band": _band(of_test)}
+            entry["laws"][method] = {"stress": runs[0]["stress"], "band": _band(runs)}
     content = {"titles": params.titles, "scenes": scenes}
     for method, parts in covered(content).items():
         whole = sum(part == 1 for values in parts.values() for part in values)
@@ -105,27 +97,14 @@ def draw(data: Mapping) -> Figure:
 
 def _curves(axes, test: str, values: Mapping, titles: Mapping[str, str]) -> None:
     x, true = np.asarray(values["x"]), 1e-3 * np.asarray(values["true"])
-    low, high = values["visited"]
-    span = axes.axhspan if values["by_stress"] else axes.axvspan
-    scale = 1e-3 if values["by_stress"] else 1.0
-    span(scale * low, scale * high, color=VISITED, linewidth=0, label="visited in the video")
+    draw_visited(axes, values["visited"], values["by_stress"], label="visited in the video")
     axes.plot(x, true, color=style.GREY, linewidth=2.4, label="true law")
-    chosen = [true]
-    for law, entry in values["laws"].items():
-        line = style.look(law).line
-        if entry["band"]:
-            ends = [1e-3 * np.asarray(entry["band"][key]) for key in ("low", "high")]
-            axes.fill_between(entry["band"]["x"], *ends, color=line["color"], alpha=0.18, linewidth=0)
-        chosen.append(1e-3 * np.asarray(entry["stress"]))
-        axes.plot(x, chosen[-1], **line, label=titles[law])
+    draw_laws(axes, values, titles)
+    curves = [true, *(1e-3 * np.asarray(law["stress"]) for law in values["laws"].values())]
     room = HEADROOM * (np.ptp(true) or 1.0)
-    ends = max(np.min(chosen), true.min() - room), min(np.max(chosen), true.max() + room)
-    margin = 0.08 * (ends[1] - ends[0] or 1.0)
-    axes.set(xlim=(x.min(), x.max()), ylim=(ends[0] - margin, ends[1] + margin))
-    axes.axhline(0, color=style.GREY, linewidth=0.4, zorder=0.5)
+    set_limits(axes, x, max(np.min(curves), true.min() - room), min(np.max(curves), true.max() + room))
     axes.set_xticks(_ticks(test, x))
     axes.xaxis.set_major_formatter("{x:g}")
-    axes.yaxis.set_major_locator(MaxNLocator(4))
 
 
 def _ticks(test: str, x: np.ndarray) -> list[float]:

@@ -1,5 +1,5 @@
-"""Simulated particles of one scene under all methods, against the particles of the ground truth. Times run to the
-right; colours are those of the methods in all figures. Paper: fig:particles_app.
+"""Particles of one scene predicted by all methods, and those of the ground truth. Time increases to the right. Colours
+are those of the methods in all figures. Paper: fig:particles_app.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ def data(inputs, params, log) -> ImageGrid:
     """A row for the truth and each method, a column for each time."""
     truth, _ = read_arrays(inputs.truth, required=("x", "vol0"), only=("x", "vol0", "frames"))
     simulated, _ = read_arrays(inputs.particles, required=("vol0",), only=("vol0",))
-    chosen = rendering.evenly(params.shown, len(truth["x"]))
-    paths = {"truth": truth["x"][chosen]}
+    picked = rendering.evenly(params.shown, len(truth["x"]))
+    paths = {"truth": truth["x"][picked]}
     for method, file in zip(params.titles, inputs.rollouts, strict=True):
-        paths[method] = read_arrays(file, required=("x",), only=("x",))[0]["x"][chosen]
+        paths[method] = read_arrays(file, required=("x",), only=("x",))[0]["x"][picked]
     cameras = rendering.frontal(
         np.concatenate([x.reshape(-1, 3) for x in paths.values()]), params.size, params.size
     )
@@ -32,7 +32,7 @@ def data(inputs, params, log) -> ImageGrid:
         rows.append(rendering.particle_pictures(x, color, rendering.sphere_radius(vol0), cameras))
     (images,) = rendering.cropped([np.stack(rows)])
     log(f"{images.shape[0]} x {images.shape[1]} pictures")
-    columns = tuple(rendering.milliseconds(truth["frames"][chosen], params.dt))
+    columns = tuple(rendering.milliseconds(truth["frames"][picked], params.dt))
     return ImageGrid(images, ("Truth", *params.titles.values()), columns)
 
 

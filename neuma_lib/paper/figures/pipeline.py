@@ -1,6 +1,6 @@
-"""One scene through all stages, from its intermediate results: Gaussians (shrunk, to be seen), surface and
-particles from the views at the start; the particles that carry Gaussians, in the colours of these; the simulation under
-the learned law; its render, the video, and the difference that training reduces. Paper: fig:structure.
+"""Intermediate results of one scene in all stages: Gaussians (shrunk for visibility), surface and particles from the
+views at the start; particles in the colours of the Gaussians bound to them; the simulation with the learned law; its
+render, the observation, and their difference, which training reduces. Paper: fig:structure.
 """
 
 from __future__ import annotations
@@ -55,10 +55,10 @@ def data(inputs, params, log) -> ImageGrid:
     video, body, cameras = rendering.film(inputs, params, 0, params.scene["density"])
     law = load_law(inputs.prior[0], inputs.adaptor[0])
     third = len(video.frames) // 3  # before it, the body only falls
-    chosen = [third + i for i in rendering.evenly(SHOWN, len(video.frames) - third)]
-    x, F = (state[chosen] for state in load_motion(inputs.rollout))
+    picked = [third + i for i in rendering.evenly(SHOWN, len(video.frames) - third)]
+    x, F = (state[picked] for state in load_motion(inputs.rollout))
 
-    seen = rendering.observed(video, chosen, params.magnify)
+    seen = rendering.observed(video, picked, params.magnify)
     rendered = rendering.renders(body, cameras, x, F)
     stressed, strongest = _stressed_particles(law, body, x, F, cameras)
     start = [_gaussians(body.gaussians, cameras), _surface(read_mesh(inputs.mesh), cameras)]
@@ -80,7 +80,7 @@ def data(inputs, params, log) -> ImageGrid:
             "squared and summed: the loss",
         ],
     }
-    columns = tuple(rendering.milliseconds([video.frames[i] for i in chosen], params.scene["dt"]))
+    columns = tuple(rendering.milliseconds([video.frames[i] for i in picked], params.scene["dt"]))
     images = np.concatenate([first[None], motion])
     log(f"{images.shape[0]} x {images.shape[1]} pictures")
     return ImageGrid(images, rows, columns, numbers)

@@ -1,5 +1,5 @@
-"""Filmed objects, cut from their videos, and the predictions of Spring-Gaus and NeuMA from the first frame on, from the
-same camera. At the right: PSNR and LPIPS (VGG) of the object, means over all cameras and measured frames. Paper:
+"""Filmed objects, segmented in their videos, and predictions of Spring-Gaus and NeuMA from the first frame, in the same
+camera. Right: PSNR and LPIPS (VGG) of the object, means over all cameras and measured frames. Paper:
 fig:realworld.
 """
 
@@ -32,8 +32,8 @@ def data(inputs, params, log) -> ImageGrid:
     for k, setting in enumerate(params.scenes.values()):
         (video,) = load_videos(inputs.shown[k], [params.view], **setting["exposure"])
         files = (inputs.particles[k], inputs.binding[k], inputs.gaussians[k])
-        chosen = rendering.evenly(params.frames, len(video.frames))
-        seen = video.select(chosen)
+        picked = rendering.evenly(params.frames, len(video.frames))
+        seen = video.select(picked)
         rows = [rendering.as_bytes(seen.colours()[:, 0])]
         measures.append([])
         for method in params.titles:

@@ -1,6 +1,6 @@
-"""A cat of two densities. Top: the particles of NeuMA with the densities that are given; below: the observation, and
-predictions of methods that know the two densities or assume one. Bars: tracer RMSE, with the Chamfer distance next to
-it (the paper's is 1.33, with another floor). Paper: fig:uneven_mass.
+"""A cat of two densities. Top: the particles of NeuMA with the given densities. Below: the observation, and predictions
+of methods that know the two densities or assume one. Bars: tracer RMSE and Chamfer distance (the paper's is 1.33, with
+another floor). Paper: fig:uneven_mass.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ def data(inputs, params, log) -> ImageGrid:
     """Columns are times. Numbers: ``rows``, ``rmse`` [mm] and ``chamfer`` [1e-4 m^2] of each method, and ``floor``."""
     (setting,) = params.scene.values()
     video, body, cameras = rendering.film(inputs, params, 0, setting["density"])
-    chosen = rendering.evenly(params.shown, len(video.frames))
-    motions = [[state[chosen] for state in load_motion(file)] for file in inputs.rollouts]
+    picked = rendering.evenly(params.shown, len(video.frames))
+    motions = [[state[picked] for state in load_motion(file)] for file in inputs.rollouts]
     density = (body.mass / body.vol0).numpy()
     heavy = density > 0.5 * (density.min() + density.max())
     colors = np.where(heavy[:, None], to_rgb(style.ORANGE), to_rgb(style.SKY))
     known, _ = motions[list(params.titles).index("neuma")]
     pictures = [rendering.particle_pictures(known, colors, rendering.sphere_radius(body.vol0), cameras)]
-    pictures.append(rendering.observed(video, chosen, params.magnify))
+    pictures.append(rendering.observed(video, picked, params.magnify))
     pictures += [rendering.renders(body, cameras, *motion) for motion in motions]
     rows = [f"NeuMA's particles:\n{density.max():.0f} (orange) and\n{density.min():.0f} kg/m³", "Observation"]
     metrics = dict(zip(params.titles, map(read_json, inputs.metrics), strict=True))
@@ -43,7 +43,7 @@ def data(inputs, params, log) -> ImageGrid:
     }
     log(", ".join(f"{method}: RMSE {value:.1f} mm" for method, value in numbers["rmse"].items()))
     (images,) = rendering.cropped([np.stack(pictures)])
-    columns = tuple(rendering.milliseconds([video.frames[i] for i in chosen], setting["dt"]))
+    columns = tuple(rendering.milliseconds([video.frames[i] for i in picked], setting["dt"]))
     return ImageGrid(images, (*rows, *params.titles.values()), columns, numbers)
 
 

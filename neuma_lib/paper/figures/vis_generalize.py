@@ -1,6 +1,6 @@
-"""Trained materials applied to what they were not trained on. (a) The letters of NeurIPS, whose particles and Gaussians
-are sampled from the glyph; blue: the scene that the material was learned in. (b) Scenes of several objects, each with
-the law learned in its own video, on one grid. Paper: fig:vis_generalize; distances stand in table 2.
+"""Trained materials applied to other bodies. (a) The letters of NeurIPS, with particles and Gaussians sampled from the
+glyph. Blue: the scene in which the material was learned. (b) Scenes of several objects on one grid, each with the law
+learned from its own video. Paper: fig:vis_generalize, with distances in table 2.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ def data(inputs, params, log) -> ImageGrid:
     points = np.concatenate([arrays["x"].reshape(-1, 3) for arrays, _ in paths[:letters] or paths])
     width, height = rendering.picture_size(*np.ptp(points, axis=0)[:2], params.size)
 
-    def filmed(k: int, cameras, chosen) -> np.ndarray:
+    def filmed(k: int, cameras, picked) -> np.ndarray:
         motion = load_motion(inputs.rollouts[k])
-        return rendering.renders(bodies[k], cameras, *(state[chosen] for state in motion))
+        return rendering.renders(bodies[k], cameras, *(state[picked] for state in motion))
 
     rows, titles, times = [], [], []
     if letters:
@@ -45,10 +45,10 @@ def data(inputs, params, log) -> ImageGrid:
     split = len(rows)
     for k, title in enumerate(params.others.values(), start=letters):
         arrays, attributes = paths[k]
-        chosen = rendering.evenly(count, len(arrays["x"]))
-        rows.append(filmed(k, rendering.frontal(arrays["x"], width, height), chosen))
+        picked = rendering.evenly(count, len(arrays["x"]))
+        rows.append(filmed(k, rendering.frontal(arrays["x"], width, height), picked))
         titles.append(title)
-        times.append(rendering.milliseconds(arrays["frames"][chosen], attributes["dt"]))
+        times.append(rendering.milliseconds(arrays["frames"][picked], attributes["dt"]))
     numbers = {
         "letters": split,
         "materials": [entry["material"] for entry in params.letters],
