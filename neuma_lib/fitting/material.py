@@ -237,6 +237,12 @@ def frame_weights(iteration: int, count: int, settings: TrainingConfig) -> Tenso
     return d ** part.to(torch.get_default_dtype())
 
 
+def weighted_mean(losses: Tensor, iteration: int, settings: TrainingConfig) -> Tensor:
+    """Mean over the frames of a video with `frame_weights`."""
+    weights = frame_weights(iteration, len(losses), settings).to(losses)
+    return (weights * losses).sum() / weights.sum()
+
+
 def train_material(
     model: MPM,
     law: Law,
@@ -376,17 +382,13 @@ class _Loop(TrainingLoop):
     def _backward(self, frame_losses: Sequence[Tensor]) -> tuple[dict[str, float], float]:
         if self.first_loss is None:
             self.first_loss = _mean(frame_losses)
-        weighted = torch.stack([self._weighted(losses) for losses in frame_losses]).mean()
+        iteration = self.before + self.iteration
+        weighted = torch.stack([weighted_mean(one, iteration, self.whole) for one in frame_losses]).mean()
         if self.settings.zero_gradients:
             self.optimizer.zero_grad(set_to_none=True)
         (weighted / max(self.first_loss, 1e-30)).backward()
         norms = {name: self._clip_gradients(p, name) for name, p in self.nets.items() if p}
         return norms, float(weighted.detach())
-
-    def _weighted(self, losses: Tensor) -> Tensor:
-        """Weighted mean over the frames of a video."""
-        weights = frame_weights(self.before + self.iteration, len(losses), self.whole).to(losses)
-        return (weights * losses).sum() / weights.sum()
 
     def _step(self) -> None:
         iteration = self.before + self.iteration

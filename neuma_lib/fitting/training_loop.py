@@ -34,7 +34,6 @@ class TrainingLoop(ABC):
 
     NAME: ClassVar[str]
     """Name of the loop in errors."""
-    RETURN: ClassVar[str] = "back to the best state, that of iteration"
 
     settings: TrainingConfig
     log: Callable[[str], None]
@@ -136,7 +135,8 @@ class TrainingLoop(ABC):
         entry = {"iteration": self.iteration, "reason": str(error), "lr_scale": self.lr_scale}
         self.history.recoveries.append(entry)
         self.log(
-            f"iteration {self.iteration}: {error}; {self.RETURN} {self.best['iteration']}, rates x{self.lr_scale:g}"
+            f"iteration {self.iteration}: {error}; back to the best state, that of iteration "
+            f"{self.best['iteration']}, rates x{self.lr_scale:g}"
         )
         self.ended = len(self.history.recoveries) > self.settings.max_recoveries
 

@@ -26,6 +26,7 @@ from neuma_lib.sim.rollout import rollout
 from neuma_lib.splatting.observation import Observation
 from tests.support.errors import refused
 from tests.support.grounding_scene import MODEL, RADIUS, ball, observe
+from tests.support.sim_scenes import law_spec as law
 
 pytestmark = pytest.mark.core
 
@@ -33,14 +34,6 @@ V0 = (0.5, -1.5, 0.0)
 FRAMES = tuple(range(0, 121, 8))
 SQUARES = (4, 8, 32)
 DENSITY = 1000.0
-
-
-def law(elasticity: str, plasticity: str = "identity", E: float = 6e4, nu: float = 0.3, **constants) -> dict:
-    return {
-        "elasticity": {"name": elasticity, "E": E, "nu": nu},
-        "plasticity": {"name": plasticity, **constants},
-    }
-
 
 ELASTIC = law("hencky")
 PLASTIC = law("hencky", "von_mises", yield_stress=4e3)

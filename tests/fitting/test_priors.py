@@ -21,30 +21,16 @@ from neuma_lib.mechanics.elasticity import STRETCH_MIN
 from neuma_lib.mechanics.law import Law, Plasticity
 from neuma_lib.mechanics.neural import PLASTIC_SCALE
 from neuma_lib.mechanics.singular_values import svd3
+from tests.support.sim_scenes import law_spec
 
-JELLY = {"elasticity": {"name": "fixed_corotated", "E": 1e5, "nu": 0.2}, "plasticity": {"name": "identity"}}
-PLASTICINE = {
-    "elasticity": {"name": "hencky", "E": 3e5, "nu": 0.25},
-    "plasticity": {"name": "von_mises", "yield_stress": 5e3},
-}
-SAND = {
-    "elasticity": {"name": "hencky", "E": 1e6, "nu": 0.2},
-    "plasticity": {"name": "drucker_prager", "friction_angle": 25},
-}
-WATER = {"elasticity": {"name": "fluid", "E": 1e5, "nu": 0.3}, "plasticity": {"name": "fluid_projection"}}
+JELLY = law_spec("fixed_corotated", E=1e5, nu=0.2)
+PLASTICINE = law_spec("hencky", "von_mises", E=3e5, nu=0.25, yield_stress=5e3)
+SAND = law_spec("hencky", "drucker_prager", E=1e6, nu=0.2, friction_angle=25)
+WATER = law_spec("fluid", "fluid_projection", E=1e5)
 OTHERS = {
-    "neo-Hookean + von Mises": {
-        "elasticity": {"name": "neo_hookean", "E": 3e5, "nu": 0.25},
-        "plasticity": {"name": "von_mises", "yield_stress": 5e3},
-    },
-    "StVK + Drucker-Prager": {
-        "elasticity": {"name": "stvk", "E": 1e6, "nu": 0.2},
-        "plasticity": {"name": "drucker_prager", "friction_angle": 25},
-    },
-    "Hencky + viscous flow": {
-        "elasticity": {"name": "hencky", "E": 1e5, "nu": 0.4},
-        "plasticity": {"name": "viscous_flow", "viscosity": 20.0},
-    },
+    "neo-Hookean + von Mises": law_spec("neo_hookean", "von_mises", E=3e5, nu=0.25, yield_stress=5e3),
+    "StVK + Drucker-Prager": law_spec("stvk", "drucker_prager", E=1e6, nu=0.2, friction_angle=25),
+    "Hencky + viscous flow": law_spec("hencky", "viscous_flow", E=1e5, nu=0.4, viscosity=20.0),
 }
 ROUGH = {"StVK + Drucker-Prager"}
 """Laws whose return map a network of the published size follows only roughly: docs/materials.md, Priors."""

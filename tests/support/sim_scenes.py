@@ -12,27 +12,24 @@ from neuma_lib.sim.state import State
 DENSITY = 1000.0
 DT = 1e-3
 
+
+def law_spec(elasticity, plasticity="identity", E=6e4, nu=0.3, **constants):
+    """Specification of an analytic law with Young's modulus E [Pa]; ``constants`` are those of the plasticity."""
+    return {
+        "elasticity": {"name": elasticity, "E": E, "nu": nu},
+        "plasticity": {"name": plasticity, **constants},
+    }
+
+
 SPECS = {
-    "fixed_corotated": {"elasticity": {"name": "fixed_corotated", "E": 5e4, "nu": 0.3}},
-    "stvk": {"elasticity": {"name": "stvk", "E": 5e4, "nu": 0.3}},
-    "hencky": {"elasticity": {"name": "hencky", "E": 5e4, "nu": 0.3}},
-    "neo_hookean": {"elasticity": {"name": "neo_hookean", "E": 5e4, "nu": 0.3}},
-    "fluid": {
-        "elasticity": {"name": "fluid", "E": 5e4, "nu": 0.3},
-        "plasticity": {"name": "fluid_projection"},
+    **{
+        name: {"elasticity": {"name": name, "E": 5e4, "nu": 0.3}}
+        for name in ("fixed_corotated", "stvk", "hencky", "neo_hookean")
     },
-    "von_mises": {
-        "elasticity": {"name": "hencky", "E": 5e4, "nu": 0.3},
-        "plasticity": {"name": "von_mises", "yield_stress": 5e2},
-    },
-    "drucker_prager": {
-        "elasticity": {"name": "hencky", "E": 5e4, "nu": 0.2},
-        "plasticity": {"name": "drucker_prager", "friction_angle": 30.0},
-    },
-    "viscous_flow": {
-        "elasticity": {"name": "hencky", "E": 5e4, "nu": 0.4},
-        "plasticity": {"name": "viscous_flow", "viscosity": 10.0},
-    },
+    "fluid": law_spec("fluid", "fluid_projection", E=5e4),
+    "von_mises": law_spec("hencky", "von_mises", E=5e4, yield_stress=5e2),
+    "drucker_prager": law_spec("hencky", "drucker_prager", E=5e4, nu=0.2, friction_angle=30.0),
+    "viscous_flow": law_spec("hencky", "viscous_flow", E=5e4, nu=0.4, viscosity=10.0),
 }
 EVERY_LAW = (*SPECS, "neural")
 

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from neuma_lib.config.training import TrainingConfig
 from neuma_lib.errors import NonFiniteError
-from neuma_lib.fitting.material import PixelLoss, frame_weights
+from neuma_lib.fitting.material import PixelLoss, weighted_mean
 from neuma_lib.fitting.training_loop import TrainingLoop
 from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.methods.spring_gaus.body import SpringBody
@@ -121,7 +121,6 @@ class _Loop(TrainingLoop):
     """State of the fit, and one pass over the video."""
 
     NAME = "springs"
-    RETURN = "back to iteration"
 
     def __init__(self, model, body, springs, start, loss, settings, options, log):
         self.model, self.body, self.springs, self.loss = model, body, springs, loss
@@ -155,8 +154,7 @@ class _Loop(TrainingLoop):
             if self.options.truncated:
                 self._frame_by_frame()
             else:
-                weights = frame_weights(self.iteration, len(losses), self.settings).to(losses)
-                self._step((weights * losses).sum() / weights.sum())
+                self._step(weighted_mean(losses, self.iteration, self.settings))
         except NonFiniteError as error:
             self._recover(error)
         else:
