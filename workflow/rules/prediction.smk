@@ -1,6 +1,5 @@
 """Inputs of predictions of splats. Needs methods.smk."""
 
-
 @checked
 def splat_start(wildcards):
     """File of the initial motion of a splat. Its law is that of another scene, as it has no video."""
