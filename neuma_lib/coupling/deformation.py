@@ -21,7 +21,7 @@ def deform(
     arms: torch.Tensor | None = None,
     covariance_gradient: bool = True,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Move and stretch Gaussians with the particles that they are bound to.
+    """Move and stretch Gaussians with the particles that they are bound to (paper Eq. 7 and 8).
 
     x_t = x_0 + B (p_t - p_0); F_bar = B F_t; A_t = F_bar A_0 F_bar^T. The first equation is the sum of the paper's
     increments, because B is constant. It is accurate for a Gaussian amid its particles. The offset a = x_0 - B p_0 of a

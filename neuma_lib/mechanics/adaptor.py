@@ -28,7 +28,7 @@ def layers_of(state: Mapping[str, Tensor], part: str, where: str) -> Weights:
 
 
 class Adaptor(nn.Module):
-    """Correction W_l = W0_l + w * s_l * Delta_l of every layer of one network.
+    """Correction W_l = W0_l + w * s_l * Delta_l of every layer of one network (Delta M of paper Eq. 3).
 
     ``Delta_l = (alpha / rank) B_l A_l`` (LoRA), or a full matrix ``D_l`` if ``rank`` is None (the paper's "w/o
     LoRA"). ``s_l`` is the root mean square of W0_l divided by that of a Xavier-uniform matrix of the same shape (1

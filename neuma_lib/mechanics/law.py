@@ -135,14 +135,14 @@ class Constitutive(nn.Module):
 
 
 class Elasticity(Constitutive):
-    """Deformation gradient F -> Kirchhoff stress tau = P F^T [Pa], both (N, 3, 3)."""
+    """Deformation gradient F -> Kirchhoff stress tau = P F^T [Pa], both (N, 3, 3) (paper Eq. 4)."""
 
     part = "elasticity"
     named: ClassVar[dict[str, type]] = {}
 
 
 class Plasticity(Constitutive):
-    """Trial deformation gradient F_trial -> elastic deformation gradient F, both (N, 3, 3)."""
+    """Trial deformation gradient F_trial -> elastic deformation gradient F, both (N, 3, 3) (paper Eq. 6)."""
 
     part = "plasticity"
     named: ClassVar[dict[str, type]] = {}

@@ -87,7 +87,7 @@ _scratch = _Scratch()
 
 
 class NeuralConstitutive(AdaptableConstitutive):
-    """A network with frozen base weights and an optional adaptor."""
+    """A network with frozen base weights and an optional adaptor: M = M_0 + Delta M (paper Eq. 3)."""
 
     kind: str
     scale: float

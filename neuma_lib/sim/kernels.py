@@ -1,8 +1,8 @@
 """Transfers of the material point method as Warp kernels: particles to grid, grid update, grid to particles.
 
 MLS-MPM (Hu et al. 2018) with quadratic B-splines and the affine velocity C of APIC (Jiang et al. 2015), in the order
-and letters of the paper's Algorithm 2 (appendix "Introduction to the Material Point Method"). Adjoints are in
-`adjoint_kernels`.
+and letters of the paper's Eq. 5 and Algorithm 2 (appendix "Introduction to the Material Point Method"). Adjoints are
+in `adjoint_kernels`.
 
 Memory: the first axis of an array is the step. ``now`` and ``after`` are the indices of the states before and after
 the current step, ``cached`` that of its stress and grid (`Workspace`). A grid node is a 4-vector: momentum and mass

@@ -35,7 +35,7 @@ def rollout(
     cache_bytes: float | None = None,
     scatter: str | None = None,
 ) -> Trajectory:
-    """Simulate particles and return their states at the frames.
+    """Simulate particles and return their states at the frames (paper Eq. 1).
 
     Differentiable with respect to the weights of the laws and to x, v, F and C of the state. Masses, volumes and
     tracers have no gradient.

@@ -207,7 +207,7 @@ def rasterize(
     buffers: RenderBuffers | None = None,
     compositor: Compositor | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Render T frames from V cameras.
+    """Render T frames from V cameras (paper Eq. 9).
 
     Differentiable with respect to ``means``, ``covars``, ``opacities`` and ``sh``. Contributions with alpha below
     ``alpha_min`` are ignored. Alpha is limited to ``alpha_max`` (without gradient). A pixel ends before the Gaussian
