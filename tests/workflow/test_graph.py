@@ -429,7 +429,7 @@ def test_motions_of_springs_and_of_experiments_are_exported_too(plan):
         ),
         (
             [*overlay(extensions=["no_such_file.py"]), TABLE],
-            "extensions: no_such_file.py: the file does not exist",
+            "/no_such_file.py does not exist. Paths are relative to the working directory",
         ),
         ([f"{SCENE}/neuma+rnk=3/metrics.json"], "no option 'rnk'; did you mean rank"),
         ([f"{SCENE}+sed=3/gaussians.ply"], "no option 'sed'; did you mean seed"),
