@@ -1,34 +1,32 @@
 """Family and constants of the material in the video: a start of training, or a law."""
 
+# A file that names its views is for methods that train on other views than the rest.
+for views in ("", "+views={views}"):
 
-rule identify:
-    input:
-        **{name: of_each_video(of_replicate(file)) for name, file in BODY.items()},
-        kernels=kernels("binding", "geometry", "laws", "rendering"),
-        mesh=of_each_video(of_replicate("mesh.ply")),
-        transforms=of_each_video(of_data("dynamic/transforms.json")),
-        velocity=of_each_video(of_replicate("velocity.json")),
-    output:
-        identified=f"{RESULTS}/{{scene}}/identified.json",
-    resources:
-        gpu=GPU,
-    params:
-        simulation=simulation_settings,
-        densities=densities_of(SETTINGS.video_scenes),
-        binding=SETTINGS.binding.plain(),
-        identify=identify_settings,
-        seed=seed_of("particles"),
-        published=published_law,
-        exposure=exposure,
-        device=SETTINGS.device,
-    script:
-        "../scripts/identify.py"
-
-
-# For methods that train on other views than the rest.
-use rule identify as identify_views with:
-    output:
-        identified=f"{RESULTS}/{{scene}}/identified+views={{views}}.json",
+    rule:
+        name:
+            "identify_views" if views else "identify"
+        input:
+            **{name: of_each_video(of_replicate(file)) for name, file in BODY.items()},
+            kernels=kernels("binding", "geometry", "laws", "rendering"),
+            mesh=of_each_video(of_replicate("mesh.ply")),
+            transforms=of_each_video(of_data("dynamic/transforms.json")),
+            velocity=of_each_video(of_replicate("velocity.json")),
+        output:
+            identified=f"{RESULTS}/{{scene}}/identified{views}.json",
+        resources:
+            gpu=GPU,
+        params:
+            simulation=simulation_settings,
+            densities=densities_of(SETTINGS.video_scenes),
+            binding=SETTINGS.binding.plain(),
+            identify=identify_settings,
+            seed=seed_of("particles"),
+            published=published_law,
+            exposure=exposure,
+            device=SETTINGS.device,
+        script:
+            "../scripts/identify.py"
 
 
 rule identified_page:
