@@ -7,13 +7,16 @@ computed with the laws.
 from __future__ import annotations
 
 import inspect
+import io
 import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import matplotlib
 import numpy as np
 import torch
+from matplotlib.figure import Figure
 
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.catalogue import DEFINED_IN, ELASTICITY, MODULI, PLASTICITY, Constant
@@ -153,49 +156,17 @@ def principal_stress(spec: Mapping, strain: np.ndarray) -> np.ndarray:
     return np.array(points)
 
 
-WIDTH, HEIGHT, MARGIN = 320, 200, (44, 8, 30, 10)
-"""Size of a picture and its margins left, right, below and above [px]."""
-
-
 def svg(lines: Sequence[tuple[str, np.ndarray]]) -> str:
     """A plot of lines: (colour, points (N, 2))."""
-    low, high = (math.exp(sign * LARGEST) for sign in (-1, 1))
-    bottom, top, step = ticks(*(f(np.concatenate([p[:, 1] for _, p in lines])) for f in (np.min, np.max)))
-    left, right, below, above = MARGIN
-
-    def place(points: np.ndarray) -> np.ndarray:
-        x = left + (points[:, 0] - low) / (high - low) * (WIDTH - left - right)
-        y = HEIGHT - below - (points[:, 1] - bottom) / (top - bottom) * (HEIGHT - below - above)
-        return np.stack([x, y], axis=1)
-
-    parts = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{WIDTH}" height="{HEIGHT}" viewBox="0 0 {WIDTH} {HEIGHT}" '
-        'font-family="sans-serif" font-size="11" fill="#333333">',
-        '<rect width="100%" height="100%" fill="#ffffff"/>',
-    ]
-    for value in np.arange(bottom, top + step / 2, step):
-        ((_, y),) = place(np.array([[low, value]]))
-        parts.append(
-            f'<path d="M{left} {y:.1f}H{WIDTH - right}" stroke="{"#888888" if abs(value) < step / 2 else "#e3e3e3"}"/>'
-            f'<text x="{left - 5}" y="{y + 4:.1f}" text-anchor="end">{value + 0.0:g}</text>'
-        )
-    for value in (0.8, 0.9, 1.0, 1.1, 1.2, 1.3):
-        ((x, _),) = place(np.array([[value, bottom]]))
-        parts.append(f'<text x="{x:.1f}" y="{HEIGHT - below + 14}" text-anchor="middle">{value:g}</text>')
-    parts.append(f'<text x="{WIDTH - right}" y="{HEIGHT - 4}" text-anchor="end">stretch λ</text>')
-    parts.append(f'<text x="{left + 4}" y="{above + 8}">τ₁ [kPa]</text>')
+    figure, file = Figure(figsize=(3.4, 2.1), layout="constrained"), io.StringIO()
+    axes = figure.add_subplot(xlabel="stretch λ", ylabel="τ₁ [kPa]")
+    axes.axhline(0.0, color="#888888", linewidth=0.5)
     for colour, points in lines:
-        path = " ".join(f"{x:.1f},{y:.1f}" for x, y in place(points))
-        parts.append(f'<polyline points="{path}" fill="none" stroke="{colour}" stroke-width="1.5"/>')
-    return "\n".join([*parts, "</svg>", ""])
-
-
-def ticks(low: float, high: float) -> tuple[float, float, float]:
-    """Ends of an axis around an interval, multiples of the distance of its ticks, and this distance."""
-    raw = (high - low) / 5
-    scale = 10.0 ** math.floor(math.log10(raw))
-    step = next(m * scale for m in (1, 2, 5, 10) if m * scale >= raw)
-    return step * math.floor(low / step - 1e-9), step * math.ceil(high / step + 1e-9), step
+        axes.plot(*points.T, color=colour, linewidth=1.2)
+    # text as text, and the same identifiers in every run
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "laws"}):
+        figure.savefig(file, format="svg", metadata={"Date": None})
+    return file.getvalue()
 
 
 def pictures() -> dict[str, str]:
