@@ -37,7 +37,7 @@ SETTINGS = overlay(
         "replicates": {"scenes": ["BouncyBall"], "methods": ["nclaw", "neuma"], "seeds": 2},
     },
     figures={"beside": [OWN_PARTICLES.rpartition("/")[2]]},
-    # So short a fit of PAC-NeRF that nothing is found.
+    # The fit of PAC-NeRF is too short to identify a law.
     radiance={"iterations": 60},
     advanced={
         "radiance.rays": 256,
