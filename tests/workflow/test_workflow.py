@@ -111,7 +111,9 @@ def test_learned_laws_move_other_bodies_and_images_are_measured(full):
     """A letter above the reconstructed ball, both with the learned law; stand-in weights for LPIPS."""
     # Lines of jobs that run at the same time may be mixed in the output.
     log = full.root / "tiny/results/logs/experiments/letter_and_ball/experiment_start.log"
-    assert "experiment_start experiments/letter_and_ball: " in full.output and "] 2 bodies, " in log.read_text()
+    assert (
+        "experiment_start experiments/letter_and_ball: " in full.output and "] 2 bodies, " in log.read_text()
+    )
     folder = full.root / "tiny/results/experiments/letter_and_ball"
     letter, ball = json.loads((folder / "velocity.json").read_text())["bodies"]
     assert letter["v0"] == [0, -2, 0] and letter["angular_velocity"] == [0, 0, 0]
