@@ -13,7 +13,7 @@ class BodyConfig(Section):
     scene: str = Field(description="scene of its material: the true law, or the law learned there")
     shape: str | None = Field(
         None,
-        description="name of a shape with a known mesh; null: the reconstructed object of the scene, with its "
+        description="name of a shape, or the path of a mesh; null: the reconstructed object of the scene, with its "
         "estimated initial motion",
     )
     size: float | None = Field(

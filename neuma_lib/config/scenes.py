@@ -69,12 +69,20 @@ OF_A_SPLAT = {
 """Defaults of a scene with a splat: half a second of fall from half a metre."""
 
 
+MESH_SUFFIXES = (".obj", ".ply", ".stl", ".glb")
+
+
+def is_mesh_file(shape: str | None) -> bool:
+    """Whether a shape is the path of a mesh, and not the name of a built-in shape."""
+    return shape is not None and shape.lower().endswith(MESH_SUFFIXES)
+
+
 class SceneConfig(Section):
     """A simulated object with its true law and the prior of its reconstruction, a captured object, or a splat."""
 
     like: str | None = Field(None, description="scene with the settings that this one does not set")
     shape: str | None = Field(
-        description="name of the shape: ball, duck, pawn, cat, bottle, fish or letter_X"
+        description="ball, duck, pawn, cat, bottle, fish, letter_X, or the path of a mesh (.obj, .ply, .stl, .glb; y up)"
     )
     size: float | None = Field(
         None, gt=0, description="longest side of the bounding box [m]; null: the shape's own"

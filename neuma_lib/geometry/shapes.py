@@ -20,6 +20,7 @@ from functools import cache
 import numpy as np
 import trimesh
 from scipy import ndimage
+from scipy.spatial import cKDTree
 from skimage import measure
 
 from neuma_lib.errors import InputError
@@ -423,11 +424,12 @@ def shape(name: str) -> Shape:
     raise InputError("shape", f"{name!r} is unknown{hint}", remedy)
 
 
-def build(name: str, size: float | None = None, resolution: int = 96) -> trimesh.Trimesh:
+def build(name: str | trimesh.Trimesh, size: float | None = None, resolution: int = 96) -> trimesh.Trimesh:
     """Mesh a solid.
 
     Args:
-        name: one of :data:`NAMES` or ``letter_A`` ... ``letter_Z``.
+        name: one of :data:`NAMES` or ``letter_A`` ... ``letter_Z``; or the closed mesh of another solid [m], whose only
+            part is ``body``.
         size: longest side of the bounding box [m]; None keeps the nominal size.
         resolution: cells along the longest side.
 
@@ -438,11 +440,23 @@ def build(name: str, size: float | None = None, resolution: int = 96) -> trimesh
     Raises:
         InputError: unknown name, or a size or resolution that is not positive.
     """
-    solid = shape(name)
+    solid = shape(name) if isinstance(name, str) else _of_mesh(name)
+    label = name if isinstance(name, str) else "mesh"
     if resolution < 8:
-        raise InputError("resolution", f"must be at least 8 for shape {name!r}, not {resolution}")
+        raise InputError("resolution", f"must be at least 8 for shape {label!r}, not {resolution}")
     if size is not None and not size > 0.0:
-        raise InputError("size", f"must be a positive length in metres for shape {name!r}, not {size}")
+        raise InputError("size", f"must be a positive length in metres for shape {label!r}, not {size}")
+    mesh = _meshed(solid, resolution) if isinstance(name, str) else name
+    nominal = mesh.vertices.copy()
+    centre = mesh.bounds.mean(axis=0)
+    scale = 1.0 if size is None else size / np.ptp(nominal, axis=0).max()
+    result = trimesh.Trimesh((nominal - centre) * scale, mesh.faces, process=False)
+    result.metadata.update(shape=label, solid=solid, scale=float(scale), centre=centre.tolist())
+    return result
+
+
+def _meshed(solid: Shape, resolution: int) -> trimesh.Trimesh:
+    """Surface of a solid in nominal metres, with ``resolution`` cells along the longest side."""
     lower, upper = _vector(*solid.lower), _vector(*solid.upper)
     cell = (upper - lower).max() / resolution
     axes = [np.arange(lo - 1.5 * cell, hi + 1.5 * cell, cell) for lo, hi in zip(lower, upper, strict=True)]
@@ -455,17 +469,26 @@ def build(name: str, size: float | None = None, resolution: int = 96) -> trimesh
     )
     vertices = vertices.astype(np.float64) + _vector(*(axis[0] for axis in axes))
     mesh = trimesh.Trimesh(vertices, faces, process=True)
-    mesh = max(mesh.split(only_watertight=False), key=lambda body: abs(body.volume))
-    nominal = mesh.vertices.copy()
-    centre = mesh.bounds.mean(axis=0)
-    scale = 1.0 if size is None else size / np.ptp(nominal, axis=0).max()
-    result = trimesh.Trimesh((nominal - centre) * scale, mesh.faces, process=False)
-    result.metadata.update(shape=name, scale=float(scale), centre=centre.tolist())
-    return result
+    return max(mesh.split(only_watertight=False), key=lambda body: abs(body.volume))
+
+
+def _of_mesh(mesh: trimesh.Trimesh) -> Shape:
+    """The solid in a closed mesh with small triangles; its distance is that to the plane of the nearest vertex."""
+    vertices, normals, tree = mesh.vertices, mesh.vertex_normals, cKDTree(mesh.vertices)
+
+    def distance(p: Array) -> Array:
+        nearest = tree.query(p)[1]
+        return np.einsum("ij,ij->i", p - vertices[nearest], normals[nearest])
+
+    return Shape({"body": distance}, 0.0, *mesh.bounds.tolist())
 
 
 def place(
-    name: str, size: float | None, height: float, center: Sequence[float], resolution: int = 96
+    name: str | trimesh.Trimesh,
+    size: float | None,
+    height: float,
+    center: Sequence[float],
+    resolution: int = 96,
 ) -> trimesh.Trimesh:
     """The solid at its initial position in a scene.
 
@@ -487,10 +510,10 @@ def to_nominal(mesh: trimesh.Trimesh, points: Array) -> tuple[Shape, Array]:
     Raises:
         InputError: the mesh was not created by :func:`build`.
     """
-    if "shape" not in mesh.metadata:
+    if "solid" not in mesh.metadata:
         raise InputError("mesh", "was not created by geometry.shapes.build, so its parts are unknown")
     local = np.asarray(points, dtype=np.float64) - mesh.bounds.mean(axis=0)
-    return shape(mesh.metadata["shape"]), local / mesh.metadata["scale"] + np.asarray(mesh.metadata["centre"])
+    return mesh.metadata["solid"], local / mesh.metadata["scale"] + np.asarray(mesh.metadata["centre"])
 
 
 def depth(mesh: trimesh.Trimesh, points: Array) -> Array:

@@ -27,6 +27,8 @@ _COUNT_TOLERANCE = 0.01
 """Relative error of the count at which the attempts stop; the guaranteed error is 5 %."""
 _CELLS_PER_POINT = 4
 """Cells per point of the grid that reduces the number of evaluated winding numbers."""
+_MAX_CELLS = 20_000_000
+"""Maximum number of cells, or of independent points, in the bounding box of a sampled body: about 2 GB."""
 
 
 def check_mesh(mesh: trimesh.Trimesh, name: str = "mesh") -> None:
@@ -95,18 +97,32 @@ def _regions(mesh: trimesh.Trimesh, points: Array) -> NDArray[np.int64]:
     return own
 
 
+def signed_distance(mesh: trimesh.Trimesh, points: Array) -> Array:
+    """Distances [m] of points (P, 3) [m] to the faces of a mesh, negative inside, shape (P,).
+
+    Inside is where the winding number exceeds 1/2, also for a mesh with holes or overlapping parts.
+    """
+    signs, distances = _nearest_faces(mesh, points, reach=float(np.ptp([*mesh.bounds, *points], axis=0).sum()))
+    return signs * distances.astype(np.float64)
+
+
 def _winding_inside(mesh: trimesh.Trimesh, points: Array) -> NDArray[np.bool_]:
     """`inside` for points (P, 3) within the mesh's bounds, by the winding number of each."""
-    centre, diagonal = mesh.bounds.mean(axis=0), float(np.linalg.norm(mesh.extents))
+    return _nearest_faces(mesh, points, reach=float(np.linalg.norm(mesh.extents)))[0] < 0
+
+
+def _nearest_faces(mesh: trimesh.Trimesh, points: Array, reach: float) -> tuple[NDArray, NDArray]:
+    """Side (P,), -1 inside and 1 outside, and distance (P,) [m] of points (P, 3), which is less than ``reach``."""
+    centre = mesh.bounds.mean(axis=0)
     body = wp.Mesh(
         wp.array(mesh.vertices - centre, dtype=wp.vec3, device="cpu"),
         wp.array(mesh.faces.ravel(), dtype=wp.int32, device="cpu"),
         support_winding_number=True,
     )
-    signs = wp.empty(len(points), dtype=wp.float32, device="cpu")
+    signs, distances = (wp.empty(len(points), dtype=wp.float32, device="cpu") for _ in range(2))
     queries = wp.array(points - centre, dtype=wp.vec3, device="cpu")
-    wp.launch(_winding_signs, len(points), [body.id, queries, diagonal], [signs], device="cpu")
-    return signs.numpy() < 0
+    wp.launch(_winding_signs, len(points), [body.id, queries, reach], [signs, distances], device="cpu")
+    return signs.numpy(), distances.numpy()
 
 
 @wp.kernel(enable_backward=False)
@@ -115,9 +131,12 @@ def _winding_signs(
     points: wp.array(dtype=wp.vec3),
     reach: wp.float32,  # larger than the distance of any point to the mesh
     signs: wp.array(dtype=wp.float32),  # out: -1 inside, 1 outside
+    distances: wp.array(dtype=wp.float32),  # out: to the nearest face
 ):
     i = wp.tid()
-    signs[i] = wp.mesh_query_point_sign_winding_number(mesh, points[i], reach).sign
+    found = wp.mesh_query_point_sign_winding_number(mesh, points[i], reach)
+    signs[i] = found.sign
+    distances[i] = wp.length(points[i] - wp.mesh_eval_position(mesh, found.face, found.u, found.v))
 
 
 def check_apart(meshes: Sequence[trimesh.Trimesh]) -> None:
@@ -147,18 +166,27 @@ def sample_volume(
         Points [m], shape (n, 3), with n equal to ``count`` (uniform) or within 5 % of it (jittered).
 
     Raises:
-        InputError: see `check_mesh`; a count that cannot be reached.
+        InputError: see `check_mesh`; a count that cannot be reached; a body too thin for its bounding box.
     """
     check_mesh(mesh)
     if count < 1:
         raise InputError("sample_volume: count", f"must be at least 1, not {count}")
     if method not in ("jittered", "uniform"):
         raise InputError("sample_volume: method", f"must be jittered or uniform, not {method!r}")
+    spacing, filled = float(np.cbrt(mesh.volume / count)), float(mesh.volume / np.prod(mesh.extents))
+    with np.errstate(divide="ignore"):
+        cells = count / filled if method == "uniform" else float(np.prod(mesh.extents / spacing + 2))
+    if not cells <= _MAX_CELLS:
+        raise InputError(
+            "sample_volume: mesh",
+            f"fills {filled:.2g} of its bounding box, so that {count} points inside need {cells:.3g} cells, more than "
+            f"{_MAX_CELLS:,}",
+            "Use a thicker body, or fewer particles and tracers",
+        )
     rng = np.random.default_rng(seed)
     if method == "uniform":
         return _uniform(mesh, count, rng)
     best = np.empty((0, 3))
-    spacing = float(np.cbrt(mesh.volume / count))
     for _ in range(_ATTEMPTS):
         points = _jittered_grid(mesh.bounds, spacing, rng)
         points = points[inside(mesh, points)]

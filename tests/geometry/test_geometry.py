@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import resource
 
 import numpy as np
 import pytest
@@ -271,6 +272,45 @@ def test_samples_are_repeatable_and_seeds_differ(bodies):
 
 def test_tracers_are_a_hundred_thousand(bodies):
     assert len(sample_tracers(bodies["duck"], seed=9)) == pytest.approx(100_000, rel=0.01)
+
+
+def needle(*sides):
+    """A box of these sides along the diagonal of the unit cube."""
+    turned = trimesh.geometry.align_vectors([1, 0, 0], [1, 1, 1])
+    return trimesh.creation.box(sides).apply_transform(turned)
+
+
+@pytest.mark.parametrize(
+    ("mesh", "method"),
+    [
+        (needle(1, 1e-5, 1e-5), "jittered"),
+        (needle(1, 1e-5, 1e-5), "uniform"),
+        (trimesh.creation.box((1, 1e-9, 1e-9)), "jittered"),
+    ],
+)
+def test_a_needle_is_refused_before_its_cells_are_allocated(mesh, method):
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with refused("mesh", problem="2000 points", remedy="thicker"):
+        sample_volume(mesh, 2000, method=method)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < before + 100_000  # kB
+
+
+def test_a_rod_that_fills_a_thousandth_of_its_box_is_sampled():
+    mesh = needle(0.5, 0.02, 0.02)
+    assert len(sample_volume(mesh, 2000)) == pytest.approx(2000, rel=0.05)
+
+
+def test_signed_distance_to_overlapping_and_open_parts():
+    """Closed form for a ball; the side is right inside an overlap, and next to a hole."""
+    ball = trimesh.creation.icosphere(4, radius=0.1)
+    points = np.random.default_rng(0).uniform(-0.2, 0.2, (500, 3))
+    distance = volume.signed_distance(ball, points)
+    np.testing.assert_allclose(distance, np.linalg.norm(points, axis=1) - 0.1, atol=3e-4)
+    open_ball = trimesh.Trimesh(ball.vertices, ball.faces[5:], process=False)
+    both = trimesh.util.concatenate([open_ball, open_ball.copy().apply_translation([0.05, 0.0, 0.0])])
+    radii = np.linalg.norm(points[:, None] - [[0, 0, 0], [0.05, 0, 0]], axis=2).min(axis=1)
+    clear = np.abs(radii - 0.1) > 0.01
+    assert ((volume.signed_distance(both, points) < 0) == (radii < 0.1))[clear].all()
 
 
 def test_volume_iou_of_boxes_is_exact():
