@@ -446,7 +446,9 @@ def build(name: str | trimesh.Trimesh, size: float | None = None, resolution: in
         raise InputError("resolution", f"must be at least 8 for shape {label!r}, not {resolution}")
     if size is not None and not size > 0.0:
         raise InputError("size", f"must be a positive length in metres for shape {label!r}, not {size}")
-    mesh = _meshed(solid, resolution) if isinstance(name, str) else name
+    mesh = name
+    if isinstance(name, str):
+        mesh = max(meshed(solid, resolution), key=lambda body: abs(body.volume))
     nominal = mesh.vertices.copy()
     centre = mesh.bounds.mean(axis=0)
     scale = 1.0 if size is None else size / np.ptp(nominal, axis=0).max()
@@ -455,8 +457,8 @@ def build(name: str | trimesh.Trimesh, size: float | None = None, resolution: in
     return result
 
 
-def _meshed(solid: Shape, resolution: int) -> trimesh.Trimesh:
-    """Surface of a solid in nominal metres, with ``resolution`` cells along the longest side."""
+def meshed(solid: Shape, resolution: int) -> list[trimesh.Trimesh]:
+    """Surfaces of the bodies and cavities of a solid, in nominal metres, with ``resolution`` cells a longest side."""
     lower, upper = _vector(*solid.lower), _vector(*solid.upper)
     cell = (upper - lower).max() / resolution
     axes = [np.arange(lo - 1.5 * cell, hi + 1.5 * cell, cell) for lo, hi in zip(lower, upper, strict=True)]
@@ -468,8 +470,7 @@ def _meshed(solid: Shape, resolution: int) -> trimesh.Trimesh:
         values, 0.0, spacing=(cell,) * 3, gradient_direction="descent", allow_degenerate=False
     )
     vertices = vertices.astype(np.float64) + _vector(*(axis[0] for axis in axes))
-    mesh = trimesh.Trimesh(vertices, faces, process=True)
-    return max(mesh.split(only_watertight=False), key=lambda body: abs(body.volume))
+    return trimesh.Trimesh(vertices, faces, process=True).split(only_watertight=False)
 
 
 def _of_mesh(mesh: trimesh.Trimesh) -> Shape:
