@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import subprocess
 import sys
@@ -62,6 +63,8 @@ def _parser() -> argparse.ArgumentParser:
         "The scene runs unchanged and has comments on what to change. Prints the commands to run next.",
     )
     scene.add_argument("name", metavar="NAME", help="name of the scene and of its folder in results/")
+    mesh = "shape of the object, .obj, .ply, .stl or .glb with y up; copied to meshes/ if outside the project"
+    scene.add_argument("--mesh", metavar="FILE", help=mesh)
     capture = _command(
         new,
         _new_capture,
@@ -184,7 +187,7 @@ def _new_scene(options: argparse.Namespace) -> None:
     from neuma_lib.project.scaffold import new_scene
 
     settings, root = Project.find(".")
-    file, name = new_scene(root, options.name, settings).relative_to(root), options.name
+    file, name = new_scene(root, options.name, settings, options.mesh).relative_to(root), options.name
     print(f"Created {file}. Edit it, then run in {root}:")
     print(f"  neuma check {file}")
     print(f"  snakemake --cores 2 --configfile {file} -- results/{name}/film.mp4 results/{name}/viewer.html")
@@ -220,7 +223,8 @@ def _check(options: argparse.Namespace) -> int:
         except InputError as error:
             problems += checks.lines(error)
         else:
-            problems += checks.problems(settings)
+            with contextlib.chdir(root):  # paths of meshes are relative to it
+                problems += checks.problems(settings)
             problems += checks.capture_problems(capture_folders(root / settings.captures.root))
             text = checks.summary(settings, ["config/config.yaml", *files])
     print("\n".join(dict.fromkeys(problems)) or text)

@@ -1,8 +1,14 @@
 """Input files as Snakemake hands them to scripts, and as users name them."""
 
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from neuma_lib.config.scenes import is_mesh_file
 from neuma_lib.errors import InputError
+
+if TYPE_CHECKING:
+    from trimesh import Trimesh
 
 COUNTED = ("all_data.json", "camera.json")
 """Lists of images whose frames are counted, not named by simulated steps (`neuma_lib.io.datasets.layouts`)."""
@@ -25,3 +31,15 @@ def image_list(place: str, stride: int | None, key: str, stride_key: str) -> str
             stride_key, f"missing, but {place} numbers frames", "Give the simulated steps between two frames"
         )
     return place
+
+
+def solid(shape: str, meshes: Iterator[str]) -> "str | Trimesh":
+    """What `neuma_lib.geometry.shapes.place` needs for a shape: its name, or the user's mesh, repaired.
+
+    Args:
+        shape: of a body.
+        meshes: files of the repaired meshes of this body and of the next ones that have one.
+    """
+    from neuma_lib.io.mesh import read_mesh
+
+    return read_mesh(next(meshes)) if is_mesh_file(shape) else shape

@@ -7,17 +7,19 @@ import importlib.metadata
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from neuma_lib.config.scenes import is_mesh_file
 from neuma_lib.config.validation import hint
 from neuma_lib.errors import InputError
 from neuma_lib.mechanics.catalogue import COURANT_LIMIT, DEFINED_IN, check_law, longitudinal_modulus
 from neuma_lib.project.capture_folder import NAME, read_capture
 from neuma_lib.project.capture_scenes import training_takes
-from neuma_lib.project.random_scenes import LETTER, SHAPES
+from neuma_lib.project.random_scenes import LETTER, SHAPES, Proportions
 from neuma_lib.project.settings import Config
 
 ROUND_OFF = 1e-6
@@ -111,10 +113,17 @@ def _experiment_problems(settings: Config) -> Iterator[str]:
 def _start_problems(where: str, body: Mapping[str, Any], dt: float, grid: int) -> Iterator[str]:
     """Problems of the shape, the position and the motion that a body starts with."""
     shape = body["shape"]
-    if not (shape in SHAPES or re.fullmatch(r"letter_[A-Z]", shape)):
+    if is_mesh_file(shape):
+        try:
+            proportions = _mesh_proportions(shape)
+        except InputError as error:
+            yield f"{where}.shape: {error}"
+            return
+    elif shape in SHAPES or re.fullmatch(r"letter_[A-Z]", shape):
+        proportions = SHAPES.get(shape, LETTER)
+    else:
         yield f"{where}.shape: {shape!r} is unknown{hint(shape, [*SHAPES, 'letter_A'])}"
         return
-    proportions = SHAPES.get(shape, LETTER)
     size = body["size"] or proportions.size
     half = size * np.array(proportions.sides) / 2
     middle = np.array([body["center"][0], body["height"], body["center"][1]])
@@ -132,6 +141,17 @@ def _start_problems(where: str, body: Mapping[str, Any], dt: float, grid: int) -
             f"{where}.velocity: at up to {speed:.3g} m/s a particle crosses a grid cell of {1 / grid:.3g} m in a time "
             f"step of {dt:g} s. Reduce velocity, spin or dt"
         )
+
+
+@cache
+def _mesh_proportions(file: str) -> Proportions:
+    """Proportions of the mesh in a file; the centre of its area stands for that of its mass."""
+    from neuma_lib.io.mesh import read_any_mesh
+
+    mesh = read_any_mesh(file)
+    size = float(mesh.extents.max())
+    centre = (mesh.centroid - mesh.bounds.mean(axis=0)) / size
+    return Proportions(size, tuple(mesh.extents / size), tuple(centre), ("body",))
 
 
 def _courant_problem(

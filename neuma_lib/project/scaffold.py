@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import re
+import shutil
 from pathlib import Path
 
 from neuma_lib.errors import InputError
@@ -19,7 +21,7 @@ SCENE = """\
 scenes:
   {name}:
     # What is filmed. The box is a cube of 1 m: x to the right, y up, z towards the first camera, floor at y = 0.
-    shape: duck                     # ball, duck, pawn, cat, bottle, fish, or letter_A ... letter_Z
+    shape: {shape}
     size: 0.36                      # longest side [m]
     center: [0.45, 0.5]             # x and z of the centre [m]
     height: 0.40                    # y of the centre [m]
@@ -42,7 +44,7 @@ scenes:
     # How Blender renders it: `body` and other parts of the shape have their own colours.
     appearance:
       kind: solid                   # solid, grains or liquid
-      colors: {{body: "#f4c534", wing: "#e8a528", beak: "#e8742c", eye: "#2b2522"}}
+      colors: {{{colors}}}
       accent: "#d98a24"
       contrast: 0.5
 """
@@ -65,11 +67,25 @@ density: 1000             # mass over volume [kg/m^3], from a kitchen scale
 """
 
 
-def new_scene(root: Path, name: str, settings: Config) -> Path:
+BUILT_IN = {
+    "shape": "duck                     # ball, duck, pawn, cat, bottle, fish, letter_A ... letter_Z, or a mesh file",
+    "colors": 'body: "#f4c534", wing: "#e8a528", beak: "#e8742c", eye: "#2b2522"',
+}
+OWN_MESH = {
+    "shape": '{file}   # y up; of any size and quality: scaled to `size`, closed and evenly meshed',
+    "colors": 'body: "#f4c534"',
+}
+
+
+def new_scene(root: Path, name: str, settings: Config, mesh: str | Path | None = None) -> Path:
     """Write config/<name>.yaml with a scene of that name.
 
+    Args:
+        root: folder of the project.
+        mesh: file with the shape of the object; None: a duck. It is copied to meshes/ if it is outside the project.
+
     Raises:
-        InputError: a name that cannot be used, or that exists.
+        InputError: a name that cannot be used, or that exists; a mesh that cannot be read.
     """
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
         raise InputError(
@@ -77,7 +93,21 @@ def new_scene(root: Path, name: str, settings: Config) -> Path:
         )
     if name in settings.scenes or name in settings.experiments:
         raise InputError(name, "a scene or experiment of this name exists", "Choose another name")
-    return _written(root / "config" / f"{name}.yaml", SCENE.format(name=name))
+    target = root / "config" / f"{name}.yaml"
+    if mesh is None:
+        return _written(target, SCENE.format(name=name, **BUILT_IN))
+    from neuma_lib.io.mesh import read_any_mesh
+
+    read_any_mesh(mesh)
+    file = Path(mesh).resolve()
+    if not file.is_relative_to(root.resolve()):
+        copy = root.resolve() / "meshes" / f"{name}{file.suffix.lower()}"
+        if copy.exists() or target.exists():
+            raise InputError(copy if copy.exists() else target, "the file exists", "Choose another name")
+        copy.parent.mkdir(exist_ok=True)
+        file = Path(shutil.copyfile(file, copy))
+    shape = OWN_MESH["shape"].format(file=json.dumps(file.relative_to(root.resolve()).as_posix()))
+    return _written(target, SCENE.format(name=name, **{**OWN_MESH, "shape": shape}))
 
 
 def new_capture(root: Path, name: str, settings: Config) -> Path:

@@ -28,13 +28,30 @@ rule kernels:
         "../scripts/kernels.py"
 
 
+SIMULATED = f"{scenes_with('truth', 'made')}|experiments/({'|'.join(SETTINGS.experiments) or 'none'})"
+
+
+rule solid:
+    input:
+        kernels=kernels("geometry"),
+        mesh=lambda wildcards: body_settings("shape", "size")(wildcards)[int(wildcards.body)]["shape"],
+    output:
+        mesh=f"{DATA}/{{scene}}/solid_{{body}}.ply",
+    wildcard_constraints:
+        scene=SIMULATED,
+        body="[0-9]+",
+    script:
+        "../scripts/solid.py"
+
+
 rule ground_truth:
     input:
         kernels=kernels("geometry", "simulation"),
+        meshes=solid_meshes(),
     output:
         truth=f"{DATA}/{{scene}}/truth.h5",
     wildcard_constraints:
-        scene=f"{scenes_with('truth', 'made')}|experiments/({'|'.join(SETTINGS.experiments) or 'none'})",
+        scene=SIMULATED,
     resources:
         gpu=EITHER_GPU,
         mem_mb=truth_memory,
@@ -58,6 +75,7 @@ for part, part_images in (("static", SETTINGS.dataset.static), ("dynamic", SETTI
             f"render_{part}"
         input:
             truth=f"{DATA}/{{scene}}/truth.h5",
+            meshes=solid_meshes(),
         output:
             transforms=f"{DATA}/{{scene}}/{part}/transforms.json",
         wildcard_constraints:

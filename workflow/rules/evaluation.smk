@@ -9,6 +9,7 @@ rule initial_state:
         mesh=of_replicate("mesh.ply"),
         particles=of_replicate("particles.h5"),
         velocity=of_replicate("velocity.json"),
+        meshes=solid_meshes(),
     output:
         report=f"{RESULTS}/{{scene}}/initial_state.json",
     wildcard_constraints:

@@ -9,6 +9,7 @@ rule experiment_start:
         gaussians=reconstructed_files("gaussians.ply"),
         mesh=reconstructed_files("mesh.ply"),
         velocity=reconstructed_files("velocity.json"),
+        meshes=solid_meshes(every=False),
     output:
         particles=f"{RESULTS}/{{scene}}/particles.h5",
         binding=f"{RESULTS}/{{scene}}/binding.h5",

@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 
+from neuma_lib.config.scenes import is_mesh_file
 from neuma_lib.project import paths
 from neuma_lib.project.settings import NO_TRUTH
 from workflow.inputs import image_list
@@ -194,6 +195,24 @@ def body_settings(*keys):
             {key: body[key] for key in keys} for body in SETTINGS.experiment_bodies(experiment)
         ],
     )
+
+
+def solid_meshes(every=True):
+    """A function of wildcards: the repaired meshes of the bodies of a scene or experiment whose shapes are files.
+
+    Without those that an experiment takes from reconstructions, if not ``every``.
+    """
+    bodies = by_subject(lambda scene: [SETTINGS.scene(scene).plain()], SETTINGS.experiment_bodies)
+
+    @checked
+    def choose(wildcards):
+        return [
+            of_data(f"solid_{k}.ply")(wildcards)
+            for k, body in enumerate(bodies(wildcards))
+            if is_mesh_file(body["shape"]) and (every or not body["reconstructed"])
+        ]
+
+    return choose
 
 
 def reconstructed_files(name):

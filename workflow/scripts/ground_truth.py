@@ -5,17 +5,20 @@ import numpy as np
 from neuma_lib.data.ground_truth import TrueBody, simulate_ground_truth
 from neuma_lib.device import choose_device
 from neuma_lib.geometry.shapes import place
+from neuma_lib.io.files import listed
 from neuma_lib.io.hdf5 import write_arrays
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.sim.model import MPM
+from workflow.inputs import solid
 from workflow.stage import run_script
 
 
 def main(inputs, output, params, run) -> None:
     model = MPM(**params.simulation)
+    meshes = iter(listed(inputs.meshes))
     bodies = [
         TrueBody(
-            place(body["shape"], body["size"], body["height"], body["center"]),
+            place(solid(body["shape"], meshes), body["size"], body["height"], body["center"]),
             analytic_law(body["law"], dt=model.dt),
             body["velocity"],
             body["density"],

@@ -4,10 +4,11 @@ import numpy as np
 
 from neuma_lib.geometry.shapes import place
 from neuma_lib.geometry.volume import volume_iou
-from neuma_lib.io.files import read_json, write_json
+from neuma_lib.io.files import listed, read_json, write_json
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.mesh import read_mesh
 from neuma_lib.io.particles import load_particles
+from workflow.inputs import solid
 from workflow.stage import run_script
 
 MIN_SPIN = 1.0
@@ -19,9 +20,10 @@ def main(inputs, output, params, run) -> None:
     scene = params.scene
     fit, velocity = read_json(inputs.gaussians), read_json(inputs.velocity)
     x0, _, attributes = load_particles(inputs.particles)
+    shape = solid(scene["shape"], iter(listed(inputs.meshes)))
     mesh, true_mesh = (
         read_mesh(inputs.mesh),
-        place(scene["shape"], scene["size"], scene["height"], scene["center"]),
+        place(shape, scene["size"], scene["height"], scene["center"]),
     )
     axes, spin = np.asarray(velocity["camera_axes"]), np.asarray(scene["spin"])
     truth, _ = read_arrays(inputs.truth, required=("x", "mass"), only=("x", "mass"))

@@ -6,8 +6,10 @@ from neuma_lib.config.blender import AppearanceConfig, ImagesConfig
 from neuma_lib.data.blender.bodies import make_body
 from neuma_lib.data.blender.scene import render_dynamic, render_static
 from neuma_lib.geometry.shapes import place
+from neuma_lib.io.files import listed
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.splatting.viewpoints import static_views, video_views
+from workflow.inputs import solid
 from workflow.stage import run_script
 
 
@@ -16,7 +18,7 @@ def main(inputs, output, params, run) -> None:
     names = ("x", "tracers", "frames")
     arrays, attributes = read_arrays(inputs.truth, only=names, required=names)
     steps = arrays["frames"].tolist() if params.moving else [0]
-    mesh = place(scene["shape"], scene["size"], scene["height"], scene["center"])
+    mesh = place(solid(scene["shape"], iter(listed(inputs.meshes))), scene["size"], scene["height"], scene["center"])
     look = AppearanceConfig(**scene["appearance"])
     body = make_body(mesh, look, arrays["x"][: len(steps)], arrays["tracers"][: len(steps)])
     viewpoints = video_views if params.moving else static_views

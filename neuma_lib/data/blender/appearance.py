@@ -53,12 +53,12 @@ def colors_at(mesh: trimesh.Trimesh, points: np.ndarray, appearance: AppearanceC
     """sRGB colours (n, 3) in [0, 1] at rest positions (n, 3) [m] in the frame of a mesh from ``shapes.build``.
 
     Raises:
-        InputError: a colour of a part that the shape does not have, or no colour of ``body``.
+        InputError: a colour of a part that a shape of several parts does not have, or no colour of ``body``.
     """
     solid, nominal = shapes.to_nominal(mesh, points)
     names = solid.part_names
     unknown = set(appearance.colors) - set(names)
-    if unknown:
+    if unknown and len(names) > 1:
         problem = f"shape {mesh.metadata['shape']!r} has no part {sorted(unknown)}; its parts are {', '.join(names)}"
         raise InputError("colors", problem)
     if "body" not in appearance.colors:
