@@ -5,6 +5,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from neuma_lib.mechanics import analytic, catalogue
+from neuma_lib.mechanics.law import Elasticity, Plasticity
 from neuma_lib.project import loading
 
 # Two OpenMP threads on a busy machine cost far more than one.
@@ -35,3 +37,21 @@ def loaded(raw):
 def changed(raw):
     """A function of changes to the settings that returns the result."""
     return lambda **changes: loading.load(loading.merged(raw, changes), ROOT)
+
+
+@pytest.fixture
+def new_laws_are_forgotten():
+    """Other tests see the built-in laws only, which are registered by the import of `analytic`."""
+    assert analytic.ELASTICITIES is Elasticity.named
+    known = (
+        catalogue.ELASTICITY,
+        catalogue.PLASTICITY,
+        catalogue.DEFINED_IN,
+        Elasticity.named,
+        Plasticity.named,
+    )
+    before = [dict(each) for each in known]
+    yield
+    for each, old in zip(known, before, strict=True):
+        each.clear()
+        each.update(old)

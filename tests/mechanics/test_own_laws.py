@@ -1,4 +1,4 @@
-"""Laws that are not built in: the classes of the page on extensions, from Python, a settings file and a law's file."""
+"""Laws that are not built in: the classes of the pages, from Python, a settings file and a law's file."""
 
 import math
 import re
@@ -8,39 +8,21 @@ import pytest
 import torch
 
 import neuma_lib as nm
-from neuma_lib.mechanics import analytic, catalogue
-from neuma_lib.mechanics.law import Elasticity, Plasticity
+from neuma_lib.mechanics import catalogue
 from neuma_lib.project.loading import load, read_yaml
 from tests.support.errors import refused
 
-pytestmark = pytest.mark.core
+pytestmark = [pytest.mark.core, pytest.mark.usefixtures("new_laws_are_forgotten")]
 
 ROOT = Path(__file__).resolve().parents[2]
 CUBIC = {"elasticity": {"name": "cubic_hencky", "E": 1e5, "nu": 0.3, "b": 20}}
 
 
-@pytest.fixture(autouse=True)
-def _forget_new_laws():
-    """Other tests see the built-in laws only, which are registered by the import of `analytic`."""
-    assert analytic.ELASTICITIES is Elasticity.named
-    known = (
-        catalogue.ELASTICITY,
-        catalogue.PLASTICITY,
-        catalogue.DEFINED_IN,
-        Elasticity.named,
-        Plasticity.named,
-    )
-    before = [dict(each) for each in known]
-    yield
-    for each, old in zip(known, before, strict=True):
-        each.clear()
-        each.update(old)
-
-
 @pytest.fixture
 def own_laws(tmp_path) -> Path:
-    """A file with the classes of the page."""
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs/extend.md").read_text(), re.DOTALL)
+    """A file with the classes of the pages."""
+    pages = "".join((ROOT / "docs" / page).read_text() for page in ("own_law.md", "extend.md"))
+    blocks = re.findall(r"```python\n(.*?)```", pages, re.DOTALL)
     path = tmp_path / "my_law.py"
     path.write_text(
         "\n".join(block for block in blocks if "class " in block and "Elasticity, name=" in block)
