@@ -1,11 +1,13 @@
 """The command `neuma`: new settings that are valid, and checks that name every problem."""
 
+import contextlib
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+import trimesh
 import yaml
 
 from neuma_lib.cli import main
@@ -48,6 +50,52 @@ def test_a_new_scene_is_valid_and_named_in_the_next_commands(project, capsys):
     assert main(["check", "config/Mine.yaml"]) == 0
     assert main(["new", "scene", "Mine"]) == 1 and main(["new", "scene", "BouncyBall"]) == 1
     assert main(["new", "scene", "../up"]) == 1
+
+
+@core
+@pytest.mark.parametrize("inside", [False, True])
+def test_a_new_scene_has_the_shape_of_a_mesh(project, capsys, tmp_path_factory, inside):
+    folder = project / "models" if inside else tmp_path_factory.mktemp("elsewhere")
+    folder.mkdir(exist_ok=True)
+    trimesh.creation.cone(20, 50).export(folder / "my cup.stl")
+    assert main(["new", "scene", "Cup", "--mesh", str(folder / "my cup.stl")]) == 0
+    shape = yaml.safe_load((project / "config/Cup.yaml").read_text())["scenes"]["Cup"]["shape"]
+    assert shape == ("models/my cup.stl" if inside else "meshes/Cup.stl")
+    assert (project / shape).read_bytes() == (folder / "my cup.stl").read_bytes()
+    capsys.readouterr()
+    assert main(["check", "config/Cup.yaml"]) == 0, capsys.readouterr().out
+
+
+@core
+def test_a_new_scene_of_a_wrong_mesh_is_not_written(project, capsys):
+    Path("cup.stl").write_text("no mesh")
+    for file in ("cup.stl", "missing.obj", "config/config.yaml"):
+        assert main(["new", "scene", "Cup", "--mesh", file]) == 1
+        assert file in capsys.readouterr().err
+    assert not Path("config/Cup.yaml").exists() and not Path("meshes").exists()
+
+
+@core
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [
+        ({}, None),
+        ({"shape": "rod.glb"}, "does not exist"),
+        ({"size": None}, "outside the box"),  # the file is in millimetres
+        ({"height": 0.1}, "below the floor"),
+        ({"spin": [0, 300, 0]}, "crosses a grid cell"),
+        ({"law": {"elasticity": {"E": 3e7}}}, "Courant"),
+    ],
+)
+def test_check_examines_a_mesh(project, capsys, changes, problem):
+    trimesh.creation.box((100.0, 300.0, 50.0)).export("rod.obj")
+    scene = {"like": "JellyDuck", "shape": "rod.obj", **changes}
+    assert main(["check", overlay(project, scenes={"Rod": scene})]) == (problem is not None)
+    out = capsys.readouterr().out
+    assert problem is None or (problem in out and out.startswith("scenes.Rod.")), out
+    Path("below").mkdir()
+    with contextlib.chdir("below"):  # the path is relative to the project's folder
+        assert main(["check", str(project / "overlay.yaml")]) == (problem is not None)
 
 
 @core

@@ -65,6 +65,8 @@ def test_the_python_code_of_the_pages_runs(project, monkeypatch):
     exec(turn, names := {})
     assert names["mesh"].extents.argmax() == 1  # upright
     names["mesh"].apply_translation([0.0, 0.0, 1.0]).export("part.stl")
-    nm.Law.from_spec({"elasticity": {"name": "hencky", "E": 1e4, "nu": 0.3}}).save("law.safetensors", {"dt": None})
+    nm.Law.from_spec({"elasticity": {"name": "hencky", "E": 1e4, "nu": 0.3}}).save(
+        "law.safetensors", {"dt": None}
+    )
     exec(simulate.replace("range(0, 401, 10)", "range(0, 3)"), names := {})
     assert names["path"].x.shape[0] == 3

@@ -26,7 +26,9 @@ _MIN_THICKNESS = 0.15
 """Minimum volume over area of a wrapped body, in edge lengths; a wrapped sheet has 0.05."""
 _MAX_AREA = 100
 """Maximum area of a mesh whose longest side is 1. Its distances take a minute; a cube has 6."""
-_REMESH = "Close its holes and give its walls a thickness, for example with Blender's modifiers Solidify and Remesh"
+_REMESH = (
+    "Close its holes and give its walls a thickness, for example with Blender's modifiers Solidify and Remesh"
+)
 
 
 def repaired(mesh: trimesh.Trimesh, edge: float, name: str = "mesh") -> trimesh.Trimesh:
@@ -109,7 +111,9 @@ def solid_body(
     body = max(bodies, key=lambda part: part.volume)
     outer = [part.volume for part in bodies if part.volume > 0]
     if len(outer) > 1:
-        done.append(f"removed all bodies but the largest, which has {body.volume / sum(outer):.1%} of the volume")
+        done.append(
+            f"removed all bodies but the largest, which has {body.volume / sum(outer):.1%} of the volume"
+        )
     if len(outer) < len(bodies):
         done.append("filled cavities")
     done.append(f"meshed with cells of 1/{resolution} of the longest side: {len(body.faces)} faces")
@@ -133,7 +137,11 @@ def _closed_by_meshlab(mesh: trimesh.Trimesh, done: list[str]) -> trimesh.Trimes
         if change := meshes.current_mesh().face_number() - before:
             done.append(text.format(abs(change)))
 
-    run("removed {} duplicate or degenerate faces", "meshing_remove_duplicate_faces", "meshing_remove_null_faces")
+    run(
+        "removed {} duplicate or degenerate faces",
+        "meshing_remove_duplicate_faces",
+        "meshing_remove_null_faces",
+    )
     run(
         "removed {} faces at edges of more than two",
         "meshing_repair_non_manifold_edges",

@@ -102,7 +102,9 @@ def signed_distance(mesh: trimesh.Trimesh, points: Array) -> Array:
 
     Inside is where the winding number exceeds 1/2, also for a mesh with holes or overlapping parts.
     """
-    signs, distances = _nearest_faces(mesh, points, reach=float(np.ptp([*mesh.bounds, *points], axis=0).sum()))
+    signs, distances = _nearest_faces(
+        mesh, points, reach=float(np.ptp([*mesh.bounds, *points], axis=0).sum())
+    )
     return signs * distances.astype(np.float64)
 
 

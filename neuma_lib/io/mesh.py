@@ -33,7 +33,9 @@ def read_any_mesh(path: str | Path) -> trimesh.Trimesh:
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise InputError(path, "is not a mesh file", f"Export it as one of {', '.join(MESH_SUFFIXES)}")
     if path.stat().st_size > MAX_MESH_BYTES:
-        problem = f"has {path.stat().st_size / 2**20:.0f} MiB, and at most {MAX_MESH_BYTES / 2**20:.0f} are read"
+        problem = (
+            f"has {path.stat().st_size / 2**20:.0f} MiB, and at most {MAX_MESH_BYTES / 2**20:.0f} are read"
+        )
         raise InputError(path, problem, _SIMPLIFY)
     arrays = arrays_from_child("neuma_lib.io.mesh:parse_any_mesh", path, "a triangle mesh")
     mesh = trimesh.Trimesh(arrays["vertices"], arrays["faces"], process=False)

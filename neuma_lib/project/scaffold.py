@@ -72,7 +72,7 @@ BUILT_IN = {
     "colors": 'body: "#f4c534", wing: "#e8a528", beak: "#e8742c", eye: "#2b2522"',
 }
 OWN_MESH = {
-    "shape": '{file}   # y up; of any size and quality: scaled to `size`, closed and evenly meshed',
+    "shape": "{file}   # y up; of any size and quality: scaled to `size`, closed and evenly meshed",
     "colors": 'body: "#f4c534"',
 }
 

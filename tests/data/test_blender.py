@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
 from PIL import Image, ImageDraw
 
 from neuma_lib.config.blender import AppearanceConfig
@@ -15,6 +16,7 @@ from neuma_lib.data.blender.bodies import make_body
 from neuma_lib.data.blender.libraries import explain_import_error
 from neuma_lib.data.blender.scene import Surface, render_dynamic, render_static
 from neuma_lib.geometry import shapes
+from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.io.gltf import linear
 from neuma_lib.io.images import read_image_set
 from neuma_lib.splatting import viewpoints as cameras
@@ -88,6 +90,18 @@ def test_colors_name_what_is_wrong():
         colors_at(mesh, mesh.vertices, AppearanceConfig(colors={"beak": "#000000"}))
     with refused("colors"):
         colors_at(mesh, mesh.vertices, AppearanceConfig(colors={"body": "yellow"}))
+
+
+def test_a_mesh_has_the_colour_of_the_body_and_ignores_parts():
+    """A scene may inherit the colours of another shape."""
+    mesh = shapes.place(trimesh.creation.icosphere(3), 0.3, 0.4, (0.5, 0.5))
+    look = AppearanceConfig(colors={"body": "#0000ff", "wing": "#ff0000"}, contrast=0.0)
+    np.testing.assert_allclose(
+        colors_at(mesh, mesh.vertices, look), np.broadcast_to([0, 0, 1.0], mesh.vertices.shape)
+    )
+    rest = sample_volume(mesh, 3000)
+    grains = make_body(mesh, AppearanceConfig(kind="grains", colors={"body": "#0000ff"}), rest[None])
+    assert 0.5 * len(rest) < grains.vertices.shape[1] < len(rest)
 
 
 def test_parts_have_their_colours():
@@ -248,10 +262,10 @@ def test_same_job_same_bytes_and_moving_mesh(tmp_path):
     for name in names:
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
     images = read_image_set(tmp_path / "a" / "transforms.json")
-    steps, index, _ = images.video([0])
-    assert steps == (0, 8)
+    first = np.flatnonzero(images.views == 0)
+    assert images.steps[first].tolist() == [0, 8]
     row, column = np.mgrid[:48, :48] + 0.5
-    alpha = images.images[index[:, 0], :, :, 3]
+    alpha = images.images[first, :, :, 3]
     middle = np.stack([(alpha * m).sum(axis=(1, 2)) / alpha.sum(axis=(1, 2)) for m in (column, row)], axis=1)
     np.testing.assert_allclose(middle, views.project(moved.mean(axis=1))[0], atol=0.15)
     times = [f["time"] for f in json.loads((tmp_path / "a" / "transforms.json").read_text())["frames"]]

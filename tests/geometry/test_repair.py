@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from neuma_lib.geometry import repair, shapes
-from neuma_lib.geometry.repair import repaired
+from neuma_lib.geometry.repair import repaired, solid_body
 from neuma_lib.geometry.volume import check_mesh, volume_iou
 from tests.support.errors import refused
 
@@ -97,3 +97,65 @@ def test_a_missing_meshlab_is_named(letter, monkeypatch):
     with refused("pymeshlab") as error:
         repaired(letter, EDGE)
     assert "make capture" in error.value.remedy
+
+
+def inverted(letter):
+    return plain(letter.vertices, letter.faces[:, ::-1])
+
+
+def doubled(letter):
+    """Every face twice, once degenerate faces are among them."""
+    corner = np.repeat(letter.faces[:50, :1], 3, axis=1)
+    return plain(letter.vertices, np.concatenate([letter.faces, letter.faces, corner]))
+
+
+DONE = {
+    with_holes: "closed holes",
+    turned_at_random: "coherently",
+    without_shared_vertices: "meshed",
+    next_to_others: "largest, which has 9",
+    inverted: "outwards",
+    doubled: "duplicate or degenerate",
+}
+
+
+@pytest.mark.parametrize("spoil", DONE, ids=lambda spoil: spoil.__name__)
+def test_any_mesh_becomes_a_solid_body_and_what_was_done_is_listed(letter, spoil):
+    pytest.importorskip("pymeshlab")
+    body, done = solid_body(spoil(letter), resolution=48)
+    check_mesh(body)
+    assert body.body_count == 1
+    assert any(DONE[spoil] in step for step in done), done
+    # half a cell at each end of a bar of the letter, which is 9 cells wide
+    assert body.volume == pytest.approx(letter.volume, rel=0.1)
+    assert volume_iou(body, letter.copy().apply_translation(-letter.bounds.mean(axis=0)), 64) > 0.9
+
+
+def test_a_closed_solid_of_overlapping_parts_needs_no_meshlab(monkeypatch):
+    """Two balls that overlap are one body, in any unit and far from the origin; the cavity in one is filled."""
+    monkeypatch.setitem(sys.modules, "pymeshlab", None)
+    ball, hole = (trimesh.creation.icosphere(3, radius) for radius in (100.0, 30.0))
+    hole.invert()
+    parts = [ball, hole, ball.copy().apply_translation([150.0, 0, 0])]
+    mesh = trimesh.util.concatenate(parts).apply_translation([1e5, 0, 0])
+    body, done = solid_body(mesh)
+    lens = np.pi * (2 * 100 - 150) ** 2 * (150**2 + 4 * 150 * 100) / (12 * 150)  # intersection of the balls
+    assert body.volume == pytest.approx(2 * 4 / 3 * np.pi * 100**3 - lens, rel=0.02)
+    np.testing.assert_allclose(body.extents, [350, 200, 200], rtol=0.01)
+    np.testing.assert_allclose(body.bounds.mean(axis=0), 0.0, atol=1e-6)
+    assert body.body_count == 1 and len(done) == 2
+
+
+@pytest.mark.parametrize(
+    ("mesh", "problem"),
+    [
+        (plain([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]), "encloses no space"),
+        (trimesh.creation.box((1, 1e-4, 1e-4)), "encloses no space"),
+        (plain(np.random.default_rng(0).random((9000, 3)), np.arange(9000).reshape(-1, 3)), "area"),
+    ],
+    ids=["sheet", "needle", "soup"],
+)
+def test_what_encloses_nothing_is_refused_as_a_solid(mesh, problem):
+    pytest.importorskip("pymeshlab")
+    with refused("cup.obj", problem=problem):
+        solid_body(mesh, "cup.obj")

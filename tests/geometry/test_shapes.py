@@ -4,6 +4,7 @@ from importlib.util import find_spec
 
 import numpy as np
 import pytest
+import trimesh
 from scipy import ndimage
 
 from neuma_lib.geometry import shapes
@@ -62,6 +63,27 @@ def test_placed_solid_keeps_its_parts():
     np.testing.assert_allclose(
         shapes.to_nominal(placed, placed.vertices)[1], shapes.to_nominal(rest, rest.vertices)[1], atol=1e-9
     )
+
+
+def test_a_mesh_is_a_solid_with_one_part():
+    """Size and place as of a built-in shape; its depth is the closed form within the sagitta of a triangle."""
+    ball = trimesh.creation.icosphere(4, 20.0).apply_translation([7.0, -3.0, 50.0])
+    placed = shapes.place(ball, 0.3, 0.42, (0.4, 0.6))
+    np.testing.assert_allclose(placed.bounds.mean(axis=0), [0.4, 0.42, 0.6], atol=1e-9)
+    np.testing.assert_allclose(placed.extents.max(), 0.3, rtol=1e-9)
+    centre = np.array([0.4, 0.42, 0.6])
+    points = centre + np.random.default_rng(0).uniform(-0.1, 0.1, (100, 3))
+    radius = np.linalg.norm(points - centre, axis=1)
+    edge = placed.edges_unique_length.max()
+    # the nearest vertex is at most an edge beside the nearest point: the plane there is farther by edge^2 / 2 R
+    bound = edge**2 / 0.3 + radius * (edge / 0.15) ** 2 / 2
+    assert (np.abs(shapes.depth(placed, points) - (0.15 - radius)) < bound).all()
+    solid, nominal = shapes.to_nominal(placed, points)
+    assert solid.part_names == ("body",)
+    np.testing.assert_allclose(nominal, ball.bounds.mean(axis=0) + (points - centre) * 40 / 0.3, atol=1e-6)
+    np.testing.assert_allclose(shapes.build(ball).extents, ball.extents)  # in metres without a size
+    with refused("size"):
+        shapes.build(ball, size=-1.0)
 
 
 def test_wrong_names_and_sizes_are_named():

@@ -18,7 +18,9 @@ def main(inputs, output, params, run) -> None:
     names = ("x", "tracers", "frames")
     arrays, attributes = read_arrays(inputs.truth, only=names, required=names)
     steps = arrays["frames"].tolist() if params.moving else [0]
-    mesh = place(solid(scene["shape"], iter(listed(inputs.meshes))), scene["size"], scene["height"], scene["center"])
+    mesh = place(
+        solid(scene["shape"], iter(listed(inputs.meshes))), scene["size"], scene["height"], scene["center"]
+    )
     look = AppearanceConfig(**scene["appearance"])
     body = make_body(mesh, look, arrays["x"][: len(steps)], arrays["tracers"][: len(steps)])
     viewpoints = video_views if params.moving else static_views
