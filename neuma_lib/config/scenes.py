@@ -82,7 +82,8 @@ class SceneConfig(Section):
 
     like: str | None = Field(None, description="scene with the settings that this one does not set")
     shape: str | None = Field(
-        description="ball, duck, pawn, cat, bottle, fish, letter_X, or the path of a mesh (.obj, .ply, .stl, .glb; y up)"
+        description="ball, duck, pawn, cat, bottle, fish, letter_X, or the path of a mesh (.obj, .ply, .stl, .glb) "
+        "with y up"
     )
     size: float | None = Field(
         None, gt=0, description="longest side of the bounding box [m]; null: the shape's own"

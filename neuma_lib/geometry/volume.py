@@ -136,9 +136,9 @@ def _winding_signs(
     distances: wp.array(dtype=wp.float32),  # out: to the nearest face
 ):
     i = wp.tid()
-    found = wp.mesh_query_point_sign_winding_number(mesh, points[i], reach)
-    signs[i] = found.sign
-    distances[i] = wp.length(points[i] - wp.mesh_eval_position(mesh, found.face, found.u, found.v))
+    query = wp.mesh_query_point_sign_winding_number(mesh, points[i], reach)
+    signs[i] = query.sign
+    distances[i] = wp.length(points[i] - wp.mesh_eval_position(mesh, query.face, query.u, query.v))
 
 
 def check_apart(meshes: Sequence[trimesh.Trimesh]) -> None:

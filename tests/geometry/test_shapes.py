@@ -75,7 +75,7 @@ def test_a_mesh_is_a_solid_with_one_part():
     points = centre + np.random.default_rng(0).uniform(-0.1, 0.1, (100, 3))
     radius = np.linalg.norm(points - centre, axis=1)
     edge = placed.edges_unique_length.max()
-    # the nearest vertex is at most an edge beside the nearest point: the plane there is farther by edge^2 / 2 R
+    # the nearest vertex is at most an edge from the nearest point: the plane there is farther by edge^2 / 2 R
     bound = edge**2 / 0.3 + radius * (edge / 0.15) ** 2 / 2
     assert (np.abs(shapes.depth(placed, points) - (0.15 - radius)) < bound).all()
     solid, nominal = shapes.to_nominal(placed, points)
