@@ -146,7 +146,7 @@ def _start_problems(where: str, body: Mapping[str, Any], dt: float, grid: int) -
 @cache
 def _mesh_proportions(file: str) -> Proportions:
     """Proportions of the mesh in a file; the centre of its area stands for that of its mass."""
-    from neuma_lib.io.mesh import read_any_mesh
+    from neuma_lib.io.mesh_files import read_any_mesh
 
     mesh = read_any_mesh(file)
     size = float(mesh.extents.max())

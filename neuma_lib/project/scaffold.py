@@ -96,7 +96,7 @@ def new_scene(root: Path, name: str, settings: Config, mesh: str | Path | None =
     target = root / "config" / f"{name}.yaml"
     if mesh is None:
         return _written(target, SCENE.format(name=name, **BUILT_IN))
-    from neuma_lib.io.mesh import read_any_mesh
+    from neuma_lib.io.mesh_files import read_any_mesh
 
     read_any_mesh(mesh)
     file = Path(mesh).resolve()

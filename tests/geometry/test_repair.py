@@ -7,7 +7,8 @@ import pytest
 import trimesh
 
 from neuma_lib.geometry import repair, shapes
-from neuma_lib.geometry.repair import repaired, solid_body
+from neuma_lib.geometry.repair import repaired
+from neuma_lib.geometry.solid_body import solid_body
 from neuma_lib.geometry.volume import check_mesh, volume_iou
 from tests.support.errors import refused
 

@@ -2,8 +2,9 @@
 
 import numpy as np
 
-from neuma_lib.geometry.repair import solid_body
-from neuma_lib.io.mesh import read_any_mesh, write_mesh
+from neuma_lib.geometry.solid_body import solid_body
+from neuma_lib.io.mesh import write_mesh
+from neuma_lib.io.mesh_files import read_any_mesh
 from workflow.stage import run_script
 
 

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from neuma_lib.io import child
-from neuma_lib.io.mesh import MAX_FACES, MAX_MESH_BYTES, read_any_mesh
+from neuma_lib.io.mesh_files import MAX_FACES, MAX_MESH_BYTES, read_any_mesh
 from tests.support.errors import refused
 
 pytestmark = pytest.mark.core
