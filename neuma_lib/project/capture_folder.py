@@ -7,12 +7,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-import yaml
-
 from neuma_lib.config.capture import CaptureConfig
 from neuma_lib.config.validation import hint, validate, with_advanced
 from neuma_lib.errors import InputError
-from neuma_lib.io.files import existing, one_line, reading
+from neuma_lib.io.files import one_line
+from neuma_lib.io.yaml_files import load_yaml
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 """Valid names of captures, takes and cameras. Results are named after them."""
@@ -93,9 +92,7 @@ def capture_folders(root: str | Path) -> list[Path]:
 
 def read_settings(path: str | Path) -> CaptureConfig:
     """Settings of a capture.yaml. Raises InputError: names the file and each invalid, missing or unknown key."""
-    content = existing(path, "Create it as in the example of docs/capture.md").read_bytes()
-    with reading(path, "YAML"):
-        raw = yaml.safe_load(content)
+    raw = load_yaml(path, "Create it as in the example of docs/capture.md")
     try:
         return validate(
             CaptureConfig, with_advanced(CaptureConfig, raw) if isinstance(raw, dict) else raw or {}

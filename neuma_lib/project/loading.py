@@ -6,15 +6,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from neuma_lib.config.capture import CapturesConfig
 from neuma_lib.config.priors import PriorsConfig
 from neuma_lib.config.simulation import SimulationConfig
 from neuma_lib.config.validation import hint, validate, with_advanced
 from neuma_lib.errors import InputError
 from neuma_lib.extensions import load_laws
-from neuma_lib.io.files import one_line
+from neuma_lib.io.yaml_files import load_yaml
 from neuma_lib.methods.registry import built_in_presets
 from neuma_lib.project.consistency import check_consistency
 from neuma_lib.project.random_scenes import RandomConfig, draw_scenes
@@ -117,21 +115,11 @@ def _complete(scenes: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read_yaml(path: str | Path) -> dict[str, Any]:
-    """A YAML file as a dict. Raises InputError naming the file when it is missing or not a mapping."""
-    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the same values, several times as fast
-    try:
-        content = yaml.load(Path(path).read_text(), Loader=loader)
-    except FileNotFoundError:
-        raise InputError(
-            path, "the file does not exist", "Give the path of an existing settings file"
-        ) from None
-    except yaml.YAMLError as error:
-        raise InputError(path, f"invalid YAML: {one_line(error)}") from None
-    if content is None:
-        return {}
-    if not isinstance(content, dict):
+    """A YAML file as a dict. Raises InputError: see `load_yaml`, or it is not a mapping."""
+    content = load_yaml(path, "Give the path of an existing settings file")
+    if not isinstance(content or {}, dict):
         raise InputError(path, f"expected lines 'key: value', not a {type(content).__name__}")
-    return content
+    return content or {}
 
 
 def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

@@ -44,7 +44,9 @@ class Project(NamedTuple):
         root = project_folder(place)
         raw: dict[str, Any] = {}
         for file in (root / SETTINGS_FILE, *configfiles):
-            raw = merged(raw, read_yaml(file))
+            if not (content := read_yaml(file)):
+                raise InputError(file, "the file is empty", "Write settings into it, or leave it out")
+            raw = merged(raw, content)
         captures = load_captures(raw)
         released = {
             name: item.model_copy(update={"folder": str(root / item.folder)})
