@@ -41,7 +41,9 @@ def parse_yaml(content: str | bytes, where: str | Path) -> Any:
             of too many aliases.
     """
     if len(content) > MAX_BYTES:
-        raise InputError(where, f"it is larger than {MAX_BYTES} bytes", "Split it or remove what is not needed")
+        raise InputError(
+            where, f"it is larger than {MAX_BYTES} bytes", "Split it or remove what is not needed"
+        )
     with reading(where, "YAML"):
         try:
             _check(content, where)

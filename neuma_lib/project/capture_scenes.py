@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from neuma_lib.config.capture import ReleasedConfig
 from neuma_lib.config.validation import hint
+from neuma_lib.config.variants import name_problem
 from neuma_lib.errors import InputError
-from neuma_lib.project.capture_folder import NAME, Capture, capture_folders, read_capture
+from neuma_lib.io.files import one_line
+from neuma_lib.project.capture_folder import Capture, capture_folders, read_capture
 from neuma_lib.project.released_captures import released_captures
 
 
@@ -17,26 +19,44 @@ def captured_scenes(
     root: str | Path,
     released: Mapping[str, ReleasedConfig] | None = None,
     planned: Mapping[str, Capture] | None = None,
+    log: Callable[[InputError], None] = lambda error: None,
 ) -> dict[str, dict[str, Any]]:
     """Settings of the scenes of all captures in a folder, of released and of planned captures, by name.
 
     A capture ``mug`` has a scene ``mug`` for its photographs and a scene ``mug_<take>`` for each take. The law is
-    learned in the first of the `training_takes`. The others are its ``videos``. Captures that cannot be read are
-    skipped, since their own rules report the error.
+    learned in the first of the `training_takes`. The others are its ``videos``.
+
+    Args:
+        log: called for each capture in the folder that has no scenes, because it cannot be read or they are those of
+            another capture. Targets that need it are refused by its own rules.
     """
     scenes: dict[str, dict[str, Any]] = {}
     for capture in (*(planned or {}).values(), *released_captures(released or {}).values()):
         scenes |= scenes_of(capture)
     for folder in capture_folders(root):
-        if not NAME.fullmatch(folder.name) or folder.name in (planned or {}):
+        if folder.name in (planned or {}):
             continue
         try:
-            capture = read_capture(folder)
-            training_takes(capture)
-        except InputError:
-            continue
-        scenes |= scenes_of(capture)
+            of_folder = scenes_of(checked_capture(folder))
+            if shared := sorted(of_folder.keys() & scenes):
+                raise InputError(folder, f"another capture has a scene {shared[0]}", "Rename one of the two")
+        except InputError as error:
+            log(error)
+        else:
+            scenes |= of_folder
     return scenes
+
+
+def checked_capture(folder: Path) -> Capture:
+    """A capture whose scenes can be used. Raises InputError: see `read_capture` and `training_takes`, or its name."""
+    if problem := name_problem(folder.absolute().name):
+        raise InputError(folder, problem, "Rename the folder")
+    try:
+        capture = read_capture(folder)
+    except OSError as error:
+        raise InputError(folder, one_line(error), "Make it readable, or move it elsewhere") from None
+    training_takes(capture)
+    return capture
 
 
 def scenes_of(capture: Capture) -> dict[str, dict[str, Any]]:

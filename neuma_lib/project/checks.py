@@ -15,8 +15,7 @@ import numpy as np
 from neuma_lib.config.validation import hint
 from neuma_lib.errors import InputError
 from neuma_lib.mechanics.catalogue import COURANT_LIMIT, DEFINED_IN, check_law, longitudinal_modulus
-from neuma_lib.project.capture_folder import NAME, read_capture
-from neuma_lib.project.capture_scenes import training_takes
+from neuma_lib.project.capture_scenes import checked_capture
 from neuma_lib.project.random_scenes import LETTER, SHAPES
 from neuma_lib.project.settings import Config
 
@@ -38,9 +37,7 @@ def capture_problems(folders: Iterable[Path]) -> list[str]:
     problems = []
     for folder in folders:
         try:
-            if not NAME.fullmatch(folder.absolute().name):
-                raise InputError(folder, "the name is invalid", "Use letters, digits, - and _")
-            training_takes(read_capture(folder))
+            checked_capture(folder)
         except InputError as error:
             problems += lines(error)
     return problems

@@ -49,7 +49,7 @@ def load(
     extensions = _extensions(raw, root)
     presets = merged(built_in_presets(extensions), raw.get("methods") or {})
     settings = validate(Config, {**raw, "extensions": extensions, "scenes": changes, "methods": presets})
-    check_consistency(settings)
+    check_consistency(settings, root)
     return settings
 
 

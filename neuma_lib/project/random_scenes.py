@@ -14,9 +14,9 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
-from pydantic import AfterValidator, ConfigDict, Field, PositiveFloat, model_validator
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, PositiveFloat, model_validator
 
-from neuma_lib.config.base import Section, Vector, internal
+from neuma_lib.config.base import Section, Seed, Vector, internal, no_boolean
 from neuma_lib.config.laws import LawConfig
 from neuma_lib.errors import InputError
 
@@ -82,7 +82,9 @@ def _ascending(pair: tuple[float, float]) -> tuple[float, float]:
 
 
 Range = Annotated[tuple[float, float], AfterValidator(_ascending)]
-PositiveRange = Annotated[tuple[PositiveFloat, PositiveFloat], AfterValidator(_ascending)]
+PositiveRange = Annotated[
+    tuple[PositiveFloat, PositiveFloat], BeforeValidator(no_boolean), AfterValidator(_ascending)
+]
 
 
 class DrawnPart(Section):
@@ -124,8 +126,8 @@ class FamilyConfig(Section):
 class RandomConfig(Section):
     """Random scenes, with names such as random7_03_duck_von_mises."""
 
-    count: int = Field(0, ge=0, description="number of scenes; a larger number keeps the first ones")
-    seed: int = Field(0, ge=0, description="seed of the scenes")
+    count: int = Field(0, ge=0, le=500, description="number of scenes; a larger number keeps the first ones")
+    seed: Seed = Field(0, description="seed of the scenes")
     methods: tuple[str, ...] = Field(
         ("nclaw", "neuma", "constants", "neuma_structured", "true_law"),
         min_length=2,
