@@ -206,7 +206,7 @@ def _new_capture(options: argparse.Namespace) -> None:
 
 def _check(options: argparse.Namespace) -> int:
     from neuma_lib.project import checks
-    from neuma_lib.project.capture_folder import capture_folders
+    from neuma_lib.project.capture_scenes import captured_scenes
     from neuma_lib.project.project import Project, project_folder
 
     captures = [file for file in options.files if Path(file).name == "capture.yaml"]
@@ -220,8 +220,10 @@ def _check(options: argparse.Namespace) -> int:
         except InputError as error:
             problems += checks.lines(error)
         else:
-            problems += checks.problems(settings)
-            problems += checks.capture_problems(capture_folders(root / settings.captures.root))
+            problems += checks.problems(settings) + checks.local_problems(settings)
+            captured_scenes(
+                root / settings.captures.root, log=lambda error: problems.extend(checks.lines(error))
+            )
             text = checks.summary(settings, ["config/config.yaml", *files])
     print("\n".join(dict.fromkeys(problems)) or text)
     return 1 if problems else 0

@@ -11,10 +11,12 @@ import yaml
 from neuma_lib.errors import InputError
 from neuma_lib.io.files import existing, one_line, reading
 
-MAX_BYTES = 1_000_000
-MAX_EXPANDED = 4_000_000  # values and characters, with every alias replaced by what it names
+MAX_BYTES = 300_000
+MAX_EXPANDED = 1_000_000  # values and characters, with every alias replaced by what it names
 MAX_DEPTH = 50  # deeper nesting overflows the stack of the parser in C
-MAX_TEXT = 10_000  # characters of one value; numbers such as 1:59:59 take quadratic time
+MAX_TEXT = (
+    3_000  # characters of one value; longer integers take quadratic time, and Python does not print them
+)
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the same values, several times as fast
 _START = (yaml.MappingStartEvent, yaml.SequenceStartEvent)
 _END = (yaml.MappingEndEvent, yaml.SequenceEndEvent)

@@ -1,4 +1,7 @@
-"""Checks of a project's settings that run nothing and load no torch: laws, shapes, starts, time steps, the GPU."""
+"""Checks of a project's settings that run nothing and load no torch: laws, shapes, starts, time steps, views, the GPU.
+
+`neuma check` and every call of Snakemake make the same checks, before the first job.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +19,7 @@ from neuma_lib.config.validation import hint
 from neuma_lib.errors import InputError
 from neuma_lib.mechanics.catalogue import COURANT_LIMIT, DEFINED_IN, check_law, longitudinal_modulus
 from neuma_lib.project.capture_scenes import checked_capture
+from neuma_lib.project.consistency import prior_errors
 from neuma_lib.project.random_scenes import LETTER, SHAPES
 from neuma_lib.project.settings import Config
 
@@ -23,13 +27,18 @@ ROUND_OFF = 1e-6
 
 
 def problems(settings: Config) -> list[str]:
-    """All problems of valid settings, one line each."""
+    """Problems of valid settings that stop every command, one line each."""
     return [
         *law_problems(settings),
+        *_view_problems(settings),
         *_scene_problems(settings),
         *_experiment_problems(settings),
-        *_device_problems(settings.device),
     ]
+
+
+def local_problems(settings: Config) -> list[str]:
+    """Problems that stop only what needs it, one line each: a GPU that is missing here, and scenes of captures."""
+    return [*_device_problems(settings.device), *_scene_problems(settings, own_captures=True)]
 
 
 def capture_problems(folders: Iterable[Path]) -> list[str]:
@@ -81,17 +90,43 @@ def _checked(where: str, spec: Mapping[str, Any]) -> tuple[dict[str, Any] | None
         return None, [str(InputError(f"{where}.{error.where}", error.problem, error.remedy))]
 
 
-def _scene_problems(settings: Config) -> Iterator[str]:
+def _scene_problems(settings: Config, own_captures: bool = False) -> Iterator[str]:
+    """Problems of the scenes of own captures, or of all others."""
     priors = settings.priors.laws
     for name, scene in settings.scenes.items():
+        if settings.is_own_capture(name) != own_captures:
+            continue
         where, world, plain = f"scenes.{name}", settings.scene_world(name), scene.plain()
+        if own_captures:
+            yield from map(str, prior_errors(settings, name))
         if scene.has_truth:
             truth = settings.scene_truth(name)
             yield from _start_problems(where, plain, scene.dt, world["grid"])
             yield from _courant_problem(f"{where}.law", plain["law"], plain["density"], truth.grid, truth.dt)
+        if scene.splat:
+            reach = plain["size"] * math.sqrt(3) / 2
+            yield from _speed_problem(where, plain, reach, scene.dt, world["grid"])
         if scene.prior in priors:
             spec, label = priors[scene.prior].plain(), f"{where}.prior = {scene.prior}"
             yield from _courant_problem(label, spec, plain["density"], world["grid"], scene.dt)
+
+
+def _view_problems(settings: Config) -> Iterator[str]:
+    """Views of videos that are rendered here, of which there are dataset.dynamic.views."""
+    rendered = {
+        name: scene
+        for name, scene in settings.scenes.items()
+        if scene.has_truth and scene.images.dynamic is None
+    }
+    sections = ("training", "identify", "velocity", "evaluation")
+    named = {f"{key}.views": getattr(settings, key).views for key in sections if rendered}
+    named |= {
+        f"scenes.{name}.training.views": scene.training.get("views") for name, scene in rendered.items()
+    }
+    count = settings.dataset.dynamic.views
+    for where, views in named.items():
+        if wrong := [view for view in views or () if not 0 <= view < count]:
+            yield f"{where}: no view {wrong[0]}. dataset.dynamic.views = {count}, which are numbered from 0"
 
 
 def _experiment_problems(settings: Config) -> Iterator[str]:
@@ -111,6 +146,9 @@ def _start_problems(where: str, body: Mapping[str, Any], dt: float, grid: int) -
     if not (shape in SHAPES or re.fullmatch(r"letter_[A-Z]", shape)):
         yield f"{where}.shape: {shape!r} is unknown{hint(shape, [*SHAPES, 'letter_A'])}"
         return
+    if missing := [key for key in ("height", "velocity", "law") if body[key] is None]:
+        yield f"{where}: the scene of a capture or splat has no {', '.join(missing)}. Give it, or choose another scene"
+        return
     proportions = SHAPES.get(shape, LETTER)
     size = body["size"] or proportions.size
     half = size * np.array(proportions.sides) / 2
@@ -123,6 +161,11 @@ def _start_problems(where: str, body: Mapping[str, Any], dt: float, grid: int) -
                 f"size = {size:g} m"
             )
     reach = float(np.linalg.norm(half + size * np.abs(proportions.mass_centre)))
+    yield from _speed_problem(where, body, reach, dt, grid)
+
+
+def _speed_problem(where: str, body: Mapping[str, Any], reach: float, dt: float, grid: int) -> Iterator[str]:
+    """The problem of a start so fast that it crosses a cell in a step, of a body that extends to ``reach`` [m]."""
     speed = math.hypot(*body["velocity"]) + math.hypot(*body["spin"]) * reach
     if speed * dt * grid >= 1:
         yield (

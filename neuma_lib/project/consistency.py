@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator
 from functools import partial, reduce
@@ -79,15 +80,18 @@ def _name_errors(settings: Config) -> Iterator[InputError]:
 
 def _folder_errors(settings: Config, root: str | Path) -> Iterator[InputError]:
     """Folders that rules write to hold nothing else."""
-    project, home = Path(root).resolve(), Path("~").expanduser()
+    project, home = Path(root).resolve(), Path(os.path.expanduser("~"))
     used: dict[Path, str] = {}
     for key in ("data_root", "results_root", "kernel_cache", "captures.root"):
         folder = reduce(getattr, key.split("."), settings)
+        if not re.fullmatch(r"[^\s~{}*?\[\]\\][^{}*?\[\]\\]{0,199}", folder) or not folder.isprintable():
+            yield InputError(
+                key, f"'{one_line(folder)}' does not name a folder", "Give one, such as results/mine"
+            )
+            continue
         path = (project / folder).resolve()
         first, *below = path.parts[1:3] or [""]
-        if not re.fullmatch(r"[^\s~{}*?\[\]\\][^{}*?\[\]\\]*", folder) or not folder.isprintable():
-            problem = f"'{one_line(folder)}' does not name a folder"
-        elif not below or path in (home, *home.parents, project, *project.parents):
+        if not below or path in (home, *home.parents, project, *project.parents):
             problem = f"{path} holds more than this project's files"
         elif path.is_relative_to(project) and path.relative_to(project).parts[0] in SOURCES:
             problem = f"{path} holds the project's own files"
@@ -102,15 +106,20 @@ def _folder_errors(settings: Config, root: str | Path) -> Iterator[InputError]:
 
 
 def _scene_errors(settings: Config, name: str) -> Iterator[InputError]:
-    scene, laws = settings.scenes[name], settings.priors.laws
-    if "/" not in scene.prior and "." not in scene.prior and scene.prior not in laws:
-        yield InputError(
-            f"scenes.{name}.prior", f"no prior '{scene.prior}' in priors.laws{hint(scene.prior, laws)}"
-        )
+    scene = settings.scenes[name]
+    if not settings.is_own_capture(name):  # otherwise it stops only what needs the capture
+        yield from prior_errors(settings, name)
     changed = {**settings.training.plain(), **scene.training}
     yield from _raised_by(validate, type(settings.training), changed, f"scenes.{name}.training")
     yield from _raised_by(settings.scene_truth, name)
     yield from _video_errors(settings, name)
+
+
+def prior_errors(settings: Config, name: str) -> Iterator[InputError]:
+    """The prior of a scene is one of the settings, or a file."""
+    prior, laws = settings.scenes[name].prior, settings.priors.laws
+    if "/" not in prior and "." not in prior and prior not in laws:
+        yield InputError(f"scenes.{name}.prior", f"no prior '{prior}' in priors.laws{hint(prior, laws)}")
 
 
 def _video_errors(settings: Config, name: str) -> Iterator[InputError]:

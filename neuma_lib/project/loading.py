@@ -47,7 +47,9 @@ def load(
     if isinstance(changes, Mapping):
         changes = _complete(_with_takes(merged(scenes, changes)))
     extensions = _extensions(raw, root)
-    presets = merged(built_in_presets(extensions), raw.get("methods") or {})
+    presets = raw.get("methods") or {}
+    if isinstance(presets, Mapping):
+        presets = merged(built_in_presets(extensions), presets)
     settings = validate(Config, {**raw, "extensions": extensions, "scenes": changes, "methods": presets})
     check_consistency(settings, root)
     return settings
@@ -61,7 +63,9 @@ def load_captures(raw: Mapping[str, Any]) -> CapturesConfig:
 def _extensions(raw: Mapping[str, Any], root: str | Path) -> tuple[str, ...]:
     """Paths of the extensions, which are loaded."""
     files = raw.get("extensions") or ()
-    if not isinstance(files, list | tuple) or not all(isinstance(file, str) for file in files):
+    if not isinstance(files, list | tuple) or not all(
+        isinstance(file, str) and file.endswith(".py") for file in files
+    ):
         raise InputError("extensions", f"{files!r} is not a list of Python files", "Write [my_method.py]")
     paths = tuple(str(Path(root) / file) for file in files)
     load_laws(paths)
@@ -104,7 +108,7 @@ def _complete(scenes: Mapping[str, Any]) -> dict[str, Any]:
         like = scene.get("like") if isinstance(scene, Mapping) else None
         if like is None:
             return scene
-        if like not in scenes:
+        if not isinstance(like, str) or like not in scenes:
             raise InputError(f"scenes.{name}.like", f"no scene '{like}'{hint(like, scenes)}")
         if like in (name, *asked):
             raise InputError(f"scenes.{name}.like", f"{like} is in turn like {name}")

@@ -97,6 +97,11 @@ class Config(Section):
         """The scene of a name or of the folder of a replicate."""
         return self.scenes[parse_replicate(name, self.scenes, "scene")[0]]
 
+    def is_own_capture(self, name: str) -> bool:
+        """Whether a scene is one of a capture in the folder of captures."""
+        captured = self.scene(name).captured
+        return captured is not None and captured.capture not in self.captures.released
+
     @property
     def random_scenes(self) -> list[str]:
         """Names of the scenes drawn at random, in order."""
