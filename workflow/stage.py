@@ -24,6 +24,7 @@ from tqdm import tqdm
 
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.extensions import load_laws
+from neuma_lib.project import versions
 from workflow.manager import end_with_snakemake
 
 PLAIN_INTERVAL = 15.0  # seconds between plain lines
@@ -33,7 +34,7 @@ WIDTH, ROWS = 80, 24  # of a terminal of unknown size
 LOG_FORMAT = "[%(asctime)s] %(message)s"
 
 _LOGGER = logging.getLogger("neuma_lib.stage")
-_SECONDS_LOGGER = logging.getLogger("neuma_lib.seconds")  # for the log alone
+_LOG_LOGGER = logging.getLogger("neuma_lib.log")  # for the log alone
 _SECONDS = "core seconds: {:.2f} to start, {:.2f} of work"  # read by neuma_lib.project.timings
 
 
@@ -78,9 +79,10 @@ def run_script(main: Callable, snakemake) -> None:
     name = " ".join(filter(None, [snakemake.rule, "/".join(snakemake.wildcards)]))
     started = _core_seconds()  # of the interpreter and all imports
     with stage(name, snakemake.log[0]) as run:
+        _LOG_LOGGER.info(versions.line())
         load_laws(snakemake.config.get("extensions") or ())
         main(snakemake.input, snakemake.output, snakemake.params, run)
-        _SECONDS_LOGGER.info(_SECONDS.format(started, _core_seconds() - started))
+        _LOG_LOGGER.info(_SECONDS.format(started, _core_seconds() - started))
 
 
 def _core_seconds() -> float:

@@ -3,6 +3,8 @@
 Jobs are read from two plans: one with the settings of tiny.yaml, and one with more scenes, tables, figures and devices.
 """
 
+import shutil
+
 import pytest
 
 from neuma_lib.errors import InputError
@@ -431,6 +433,12 @@ def test_motions_of_springs_and_of_experiments_are_exported_too(plan):
             [*overlay(extensions=["no_such_file.py"]), TABLE],
             "/no_such_file.py does not exist. Paths are relative to the working directory",
         ),
+        ([*overlay(training={"views": [7]}), TABLE], "training.views: no view 7"),
+        (
+            [*overlay(scenes={"BouncyBall": {"law": {"elasticity": {"E": 5e9}}, "height": 0.0}}), TABLE],
+            "scenes.BouncyBall.law: the Courant number",
+        ),
+        ([*overlay(results_root=""), TABLE], "results_root: '' does not name a folder"),
         ([f"{SCENE}/neuma+rnk=3/metrics.json"], "no option 'rnk'; did you mean rank"),
         ([f"{SCENE}+sed=3/gaussians.ply"], "no option 'sed'; did you mean seed"),
         (
@@ -457,6 +465,26 @@ def test_what_cannot_be_had_ends_with_one_line_before_anything_runs(project, wor
     output = project.run(*words, succeeds=False)
     assert message in output and "Traceback (most recent call last)" not in output
     assert not (project.root / "tiny").exists()
+
+
+def test_a_key_that_is_given_twice_is_refused(project, tmp_path):
+    """Snakemake keeps the last value."""
+    (tmp_path / "twice.yaml").write_text("seed: 1\nseed: 2\n")
+    output = project.run("--configfile", str(tmp_path / "twice.yaml"), "--", TABLE, succeeds=False)
+    assert "twice.yaml: line 2, column 1: the key 'seed' is in line 1 already" in output
+
+
+def test_a_broken_capture_stops_its_own_targets_only(project):
+    capture = project.root / "captures/mug/capture.yaml"
+    capture.parent.mkdir(parents=True)
+    capture.write_text("a: &a [x, x]\nboard: [*a\n")
+    try:
+        output = project.run("--dry-run", f"{SCENE}/gaussians.ply")
+        assert "captures/mug/capture.yaml: line 3, column 1: invalid YAML" in output
+        refused_target = project.run("--dry-run", f"{RESULTS}/mug/capture.md", succeeds=False)
+        assert "captures/mug/capture.yaml: line 3" in refused_target and "Traceback" not in refused_target
+    finally:
+        shutil.rmtree(capture.parent)
 
 
 def test_settings_are_refused_where_they_are_read(tiny_settings):
