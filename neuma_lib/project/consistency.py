@@ -102,7 +102,7 @@ def _folder_errors(settings: Config, root: str | Path) -> Iterator[InputError]:
         else:
             used[path] = key
             continue
-        yield InputError(key, problem, "Give a folder of its own, such as results/mine")
+        yield InputError(key, problem, "Give another folder, such as results/mine")
 
 
 def _scene_errors(settings: Config, name: str) -> Iterator[InputError]:

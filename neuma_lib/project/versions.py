@@ -35,9 +35,9 @@ def changes(results: Path) -> list[str]:
     former: Counter[tuple[str, str]] = Counter()
     for log in (results / "logs").rglob("*.log"):
         with open(log, "rb") as file:
-            found = _LINE.search(file.read(_HEAD).decode(errors="replace"))
-        count += bool(found)
-        used = (entry.partition(" ") for entry in found[1].split(", ")) if found else ()
+            match = _LINE.search(file.read(_HEAD).decode(errors="replace"))
+        count += bool(match)
+        used = (entry.partition(" ") for entry in match[1].split(", ")) if match else ()
         former.update((name, version) for name, _, version in used if now.get(name) != version)
     remedy = "To repeat them, delete them, or run snakemake with --forceall. To keep them, install the former version"
     return [

@@ -438,7 +438,7 @@ def test_motions_of_springs_and_of_experiments_are_exported_too(plan):
             [*overlay(scenes={"BouncyBall": {"law": {"elasticity": {"E": 5e9}}, "height": 0.0}}), TABLE],
             "scenes.BouncyBall.law: the Courant number",
         ),
-        ([*overlay(results_root=""), TABLE], "results_root: '' does not name a folder"),
+        ([*overlay(results_root="/"), TABLE], "results_root: / holds more than this project's files"),
         ([f"{SCENE}/neuma+rnk=3/metrics.json"], "no option 'rnk'; did you mean rank"),
         ([f"{SCENE}+sed=3/gaussians.ply"], "no option 'sed'; did you mean seed"),
         (
@@ -482,7 +482,10 @@ def test_a_broken_capture_stops_its_own_targets_only(project):
         output = project.run("--dry-run", f"{SCENE}/gaussians.ply")
         assert "captures/mug/capture.yaml: line 3, column 1: invalid YAML" in output
         refused_target = project.run("--dry-run", f"{RESULTS}/mug/capture.md", succeeds=False)
-        assert "captures/mug/capture.yaml: line 3" in refused_target and "Traceback" not in refused_target
+        assert refused_target.count("captures/mug/capture.yaml: line 3") > output.count(
+            "capture.yaml: line 3"
+        )
+        assert "Traceback (most recent call last)" not in refused_target
     finally:
         shutil.rmtree(capture.parent)
 

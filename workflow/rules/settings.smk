@@ -35,8 +35,8 @@ try:
 except InputError as error:
     raise WorkflowError(str(error)) from None
 if workflow.is_main_process:
-    if found := problems(SETTINGS):
-        raise WorkflowError("\n".join(found))
+    if wrong := problems(SETTINGS):
+        raise WorkflowError("\n".join(wrong))
     for problem in [*map(str, BROKEN), *local_problems(SETTINGS)]:
         logger.warning(problem)
 
