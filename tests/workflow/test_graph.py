@@ -467,11 +467,22 @@ def test_what_cannot_be_had_ends_with_one_line_before_anything_runs(project, wor
     assert not (project.root / "tiny").exists()
 
 
-def test_a_key_that_is_given_twice_is_refused(project, tmp_path):
-    """Snakemake keeps the last value."""
-    (tmp_path / "twice.yaml").write_text("seed: 1\nseed: 2\n")
-    output = project.run("--configfile", str(tmp_path / "twice.yaml"), "--", TABLE, succeeds=False)
-    assert "twice.yaml: line 2, column 1: the key 'seed' is in line 1 already" in output
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("seed: 1\nseed: 2\n", "line 2, column 1: the key 'seed' is in line 1 already"),
+        (
+            "a0: &a0 [x, x]\n" + "".join(f"a{k}: &a{k} [{f'*a{k - 1}, ' * 9}]\n" for k in range(1, 12)),
+            "with its aliases (*name) it expands to more than",
+        ),
+    ],
+)
+def test_files_of_settings_that_snakemake_accepts_are_refused(project, tmp_path, text, message):
+    """Snakemake keeps the last value of a key, and bounds no aliases."""
+    file = tmp_path / "mine.yaml"
+    file.write_text(text)
+    assert f"{file}: " in (output := project.run("--configfile", str(file), "--", TABLE, succeeds=False))
+    assert message in output
 
 
 def test_a_broken_capture_stops_its_own_targets_only(project):

@@ -22,6 +22,9 @@ from workflow.provenance import code_digest
 from workflow.records import keep_records_of_failed_jobs
 
 try:
+    # Snakemake has read them, but keeps the last of repeated keys and bounds no aliases.
+    for file in filter(os.path.isfile, workflow.configfiles if workflow.is_main_process else ()):
+        read_yaml(file)
     captures = load_captures(config)
     # A workflow that includes this one may plan captures before their files exist.
     PLANNED = plan_captures(config, captures.root) if "plan_captures" in globals() else {}
@@ -29,9 +32,6 @@ try:
     SETTINGS = load(
         config, captured=captured_scenes(captures.root, captures.released, PLANNED, BROKEN.append)
     )
-    # Snakemake has read them, but keeps the last of repeated keys.
-    for file in filter(os.path.isfile, workflow.configfiles if workflow.is_main_process else ()):
-        read_yaml(file)
 except InputError as error:
     raise WorkflowError(str(error)) from None
 if workflow.is_main_process:
