@@ -207,7 +207,6 @@ def _new_capture(options: argparse.Namespace) -> None:
 
 def _check(options: argparse.Namespace) -> int:
     from neuma_lib.project import checks
-    from neuma_lib.project.capture_scenes import captured_scenes
     from neuma_lib.project.project import Project, project_folder
     from neuma_lib.project.versions import changes
 
@@ -218,14 +217,11 @@ def _check(options: argparse.Namespace) -> int:
     if files or not captures:
         root = project_folder(".")
         try:
-            settings, _ = Project.find(root, files)
+            settings, _ = Project.find(root, files, lambda error: problems.extend(checks.lines(error)))
         except InputError as error:
             problems += checks.lines(error)
         else:
             problems += checks.problems(settings) + checks.local_problems(settings)
-            captured_scenes(
-                root / settings.captures.root, log=lambda error: problems.extend(checks.lines(error))
-            )
             text = checks.summary(settings, ["config/config.yaml", *files])
             for change in changes(root / settings.results_root):
                 print(f"note: {change}")

@@ -82,6 +82,7 @@ def test_a_new_capture_is_valid_and_becomes_a_scene(project, capsys, monkeypatch
         ({"center": [0.9, 0.5]}, "scenes.JellyDuck.center"),
         ({"velocity": [0, -60, 0]}, "scenes.JellyDuck.velocity"),
         ({"spin": [0, 300, 0]}, "scenes.JellyDuck.velocity"),
+        ({"velocity": [0, 0, 0], "steps": 100}, "scenes.JellyDuck.steps"),
         ({"law": {"elasticity": {"E": -1}}}, "scenes.JellyDuck.law.elasticity.E"),
         ({"law": {"elasticity": {"name": "jelly"}}}, "scenes.JellyDuck.law.elasticity.name"),
         ({"law": {"plasticity": {"name": "von_mises"}}}, "scenes.JellyDuck.law.plasticity.yield_stress"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,24 +28,30 @@ def captured_scenes(
     learned in the first of the `training_takes`. The others are its ``videos``.
 
     Args:
-        log: called for each capture in the folder that has no scenes, because it cannot be read or they are those of
-            another capture. Targets that need it are refused by its own rules.
+        log: called for each capture, released or in the folder, that has no scenes, because it cannot be read or they
+            are those of another capture. Targets that need it are refused by its own rules.
     """
     scenes: dict[str, dict[str, Any]] = {}
-    for capture in (*(planned or {}).values(), *released_captures(released or {}).values()):
+    for capture in (planned or {}).values():
         scenes |= scenes_of(capture)
-    for folder in capture_folders(root):
-        if folder.name in (planned or {}):
-            continue
+    readers = [partial(_released_capture, name, settings) for name, settings in (released or {}).items()]
+    folders = [folder for folder in capture_folders(root) if folder.name not in (planned or {})]
+    for read in [*readers, *(partial(checked_capture, folder) for folder in folders)]:
         try:
-            of_folder = scenes_of(checked_capture(folder))
-            if shared := sorted(of_folder.keys() & scenes):
-                raise InputError(folder, f"another capture has a scene {shared[0]}", "Rename one of the two")
+            capture = read()
+            own = scenes_of(capture)
+            if shared := sorted(own.keys() & scenes):
+                problem = f"another capture has a scene {shared[0]}"
+                raise InputError(capture.folder, problem, "Rename one of the two")
         except InputError as error:
             log(error)
         else:
-            scenes |= of_folder
+            scenes |= own
     return scenes
+
+
+def _released_capture(name: str, settings: ReleasedConfig) -> Capture:
+    return released_captures({name: settings})[name]
 
 
 def checked_capture(folder: Path) -> Capture:

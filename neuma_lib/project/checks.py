@@ -20,7 +20,7 @@ from neuma_lib.errors import InputError
 from neuma_lib.mechanics.catalogue import COURANT_LIMIT, DEFINED_IN, check_law, longitudinal_modulus
 from neuma_lib.project.capture_scenes import checked_capture
 from neuma_lib.project.consistency import prior_errors
-from neuma_lib.project.random_scenes import LETTER, SHAPES
+from neuma_lib.project.random_scenes import LETTER, SHAPES, flight
 from neuma_lib.project.settings import Config
 
 ROUND_OFF = 1e-6
@@ -37,8 +37,12 @@ def problems(settings: Config) -> list[str]:
 
 
 def local_problems(settings: Config) -> list[str]:
-    """Problems that stop only what needs it, one line each: a GPU that is missing here, and scenes of captures."""
-    return [*_device_problems(settings.device), *_scene_problems(settings, own_captures=True)]
+    """Problems that stop only what needs it, one line each: a missing GPU, a video without contact, captures."""
+    return [
+        *_device_problems(settings.device),
+        *_contact_problems(settings),
+        *_scene_problems(settings, own_captures=True),
+    ]
 
 
 def capture_problems(folders: Iterable[Path]) -> list[str]:
@@ -162,6 +166,22 @@ def _start_problems(where: str, body: Mapping[str, Any], dt: float, grid: int) -
             )
     reach = float(np.linalg.norm(half + size * np.abs(proportions.mass_centre)))
     yield from _speed_problem(where, body, reach, dt, grid)
+
+
+def _contact_problems(settings: Config) -> Iterator[str]:
+    """Scenes in whose videos not even the bounding box of the body touches a wall."""
+    cells = 0.5 if settings.simulation.walls == "outside" else 2.5  # at least the width of the contact zone
+    for name, scene in settings.scenes.items():
+        if scene.has_truth and scene.shape in SHAPES:
+            world, seconds = settings.scene_world(name), settings.frame_steps(name)[-1] * scene.dt
+            size = scene.size or SHAPES[scene.shape].size
+            middle, turned = flight(scene.plain(), size, world["gravity"], seconds)
+            reach, zone = np.abs(turned).sum(axis=2), cells / world["grid"]
+            if (middle - reach > zone).all() and (middle + reach < 1 - zone).all():
+                yield (
+                    f"scenes.{name}.steps: the body touches nothing in the {seconds:.3g} s of the video, so that no "
+                    "method can learn its material. Use more steps, a larger velocity or a smaller height"
+                )
 
 
 def _speed_problem(where: str, body: Mapping[str, Any], reach: float, dt: float, grid: int) -> Iterator[str]:

@@ -10,6 +10,7 @@ from neuma_lib.capture.motion.synchronisation import (
     reduced_intrinsics,
     without_gain,
 )
+from neuma_lib.config.capture import ReleasedConfig
 from neuma_lib.errors import InputError
 from neuma_lib.project import cases, checks
 from neuma_lib.project.capture_scenes import captured_scenes
@@ -106,6 +107,13 @@ def test_captures_whose_names_are_taken_are_left_out(captures, name, problem):
     broken = []
     assert {"mug", "mug_one", "mug_two"} == captured_scenes(captures, log=broken.append).keys()
     assert [problem in str(error) for error in broken] == [True]
+
+
+def test_a_released_capture_that_is_missing_leaves_other_scenes_usable(captures):
+    broken = []
+    missing = {"bun": ReleasedConfig(folder=str(captures / "nowhere"))}
+    assert {"mug", "mug_one", "mug_two"} == captured_scenes(captures, missing, log=broken.append).keys()
+    assert "nowhere" in broken[0].where
 
 
 def test_the_truth_of_a_capture_is_unknown(captures):
