@@ -24,6 +24,8 @@ from neuma_lib.project.random_scenes import LETTER, SHAPES, flight
 from neuma_lib.project.settings import Config
 
 ROUND_OFF = 1e-6
+CONTACT_CELLS = 2.5
+"""At least the width of the zone at a wall in which a body touches it [cells]."""
 
 
 def problems(settings: Config) -> list[str]:
@@ -170,13 +172,12 @@ def _start_problems(where: str, body: Mapping[str, Any], dt: float, grid: int) -
 
 def _contact_problems(settings: Config) -> Iterator[str]:
     """Scenes in whose videos not even the bounding box of the body touches a wall."""
-    cells = 0.5 if settings.simulation.walls == "outside" else 2.5  # at least the width of the contact zone
     for name, scene in settings.scenes.items():
         if scene.has_truth and scene.shape in SHAPES:
             world, seconds = settings.scene_world(name), settings.frame_steps(name)[-1] * scene.dt
             size = scene.size or SHAPES[scene.shape].size
             middle, turned = flight(scene.plain(), size, world["gravity"], seconds)
-            reach, zone = np.abs(turned).sum(axis=2), cells / world["grid"]
+            reach, zone = np.abs(turned).sum(axis=2), CONTACT_CELLS / world["grid"]
             if (middle - reach > zone).all() and (middle + reach < 1 - zone).all():
                 yield (
                     f"scenes.{name}.steps: the body touches nothing in the {seconds:.3g} s of the video, so that no "

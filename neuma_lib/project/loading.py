@@ -39,11 +39,14 @@ def load(
     scenes_file = Path(root) / str(raw.get("scenes_file", Config.model_fields["scenes_file"].default))
     named = read_yaml(scenes_file)
     refuse_old_keys({"scenes": named})
-    scenes, changes = {**named, **_random_scenes(raw)}, raw.get("scenes") or {}
-    for name in captured or {}:
-        if name in scenes:
-            raise InputError(f"scenes.{name}", "a capture has a scene of this name", "Rename one of the two")
-    scenes |= captured or {}
+    scenes, changes = dict(named), raw.get("scenes") or {}
+    for kind, others in {
+        "random settings have": _random_scenes(raw),
+        "a capture has": captured or {},
+    }.items():
+        for name in others.keys() & scenes.keys():
+            raise InputError(f"scenes.{name}", f"{kind} a scene of this name", "Rename one of the two")
+        scenes |= others
     if isinstance(changes, Mapping):
         changes = _complete(_with_takes(merged(scenes, changes)))
     extensions = _extensions(raw, root)

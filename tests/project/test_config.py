@@ -149,6 +149,13 @@ def test_mistakes_are_named(changed, change, place):
         changed(**change)
 
 
+def test_a_scene_is_not_replaced_by_a_random_one_of_its_name(raw, loaded, tmp_path):
+    name = next(iter(loaded.random_scenes))
+    (tmp_path / "scenes.yaml").write_text(f"{name}: {{shape: ball}}\n")
+    with refused(f"scenes.{name}"):
+        loading.load({**raw, "scenes_file": str(tmp_path / "scenes.yaml")}, ROOT)
+
+
 def test_folders_outside_of_the_project_can_hold_results(changed):
     for folder in ("/mnt/disk/results", "../elsewhere/results", "/dev/shm/results", "my results/"):
         assert changed(results_root=folder).results_root == folder
