@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import torch
 
 from neuma_lib.config.identify import IdentifyConfig
 from neuma_lib.config.laws import LawConfig
+from neuma_lib.config.training import TrainingConfig
 from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.errors import NonFiniteError
 from neuma_lib.fitting.families import Family
@@ -21,6 +23,9 @@ from neuma_lib.fitting.video_residuals import VideoResiduals, averaged
 from neuma_lib.io.files import write_json
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.combinations import named_combinations
+from neuma_lib.methods.base import Problem
+from neuma_lib.methods.spring_gaus.method import SpringGaus
+from neuma_lib.methods.training import Training
 from neuma_lib.sim.model import COURANT_LIMIT
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
@@ -467,6 +472,21 @@ def test_a_video_without_contact_is_refused_before_anything_is_fitted(v0, contac
     body, frames = ball(), (0, 8, 16, 24)
     with refused("frames", problem=f"first contact, expected at about {contact}", remedy="longer video"):
         identify(MODEL, known(body, v0=v0), body, observe(body, v0, frames), settings({"hencky": ELASTIC}))
+
+
+@pytest.mark.parametrize("fit", [Training, lambda *values: SpringGaus().fit(values[0], {}, *values[3:])])
+def test_methods_that_train_refuse_it_too(fit, monkeypatch):
+    body = ball(dtype=torch.float32)
+    seen = observe(body, V0, (0, 8, 16, 24))
+    for module in ("methods.training", "io.particles"):
+        monkeypatch.setattr(f"neuma_lib.{module}.load_reconstruction", lambda *files, **options: body)
+        monkeypatch.setattr(f"neuma_lib.{module}.with_motion", lambda body, file: body.state(V0))
+    for module in ("methods.training", "io.images"):
+        monkeypatch.setattr(f"neuma_lib.{module}.load_videos", lambda *files, **exposure: [seen])
+    inputs = dict.fromkeys(("particles", "binding", "gaussians", "velocity", "transforms"), "none")
+    problem = Problem({"dt": MODEL.dt, "grid": MODEL.grid}, [1000.0], {})
+    with refused("frames", problem="first contact"):
+        fit(inputs, {}, TrainingConfig(), problem, SimpleNamespace(device=torch.device("cpu")))
 
 
 def test_a_turning_body_touches_the_floor_where_one_without_spin_does_not():
