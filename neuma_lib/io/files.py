@@ -9,12 +9,14 @@ Lengths are metres, times seconds, masses kilograms; arrays are numpy.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
+import re
 import zipfile
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -26,15 +28,37 @@ def atomic(path: str | Path) -> Iterator[Path]:
     """A temporary path in the folder of ``path``, renamed to ``path`` when the block ends without an error.
 
     A killed process leaves at most one file ``.partial-<name>``, which the next run overwrites.
+
+    Raises:
+        InputError: the disk is full or the folder is read-only.
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".partial-{path.name}")
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         yield partial
         os.replace(partial, path)
+    except (OSError, RuntimeError) as error:
+        if (number := _number(error)) not in _REMEDIES:
+            raise
+        raise InputError(path, f"cannot be written: {os.strerror(number)}", _REMEDIES[number]) from None
     finally:
-        partial.unlink(missing_ok=True)
+        with suppress(OSError):  # of a read-only file system, even if there is no such file
+            partial.unlink(missing_ok=True)
+
+
+_FULL = "Free disk space and run the same command again"
+_READ_ONLY = "Make the folder writable, or choose another one (setting results_root or data_root)"
+_REMEDIES = {
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), _FULL),
+    **dict.fromkeys((errno.EROFS, errno.EACCES, errno.EPERM), _READ_ONLY),
+}
+
+
+def _number(error: OSError | RuntimeError) -> int | None:
+    """Error number of the operating system. HDF5 gives it in the text of a RuntimeError."""
+    found = re.search(r"errno = (\d+)", str(error))
+    return int(found[1]) if found else getattr(error, "errno", None)
 
 
 def write_text(path: str | Path, text: str) -> None:
