@@ -14,6 +14,7 @@ import logging
 import os
 import resource
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -123,6 +124,9 @@ class Stage:
                 nrows=ROWS,
                 bar_format=("{desc}  {bar:24}  " if moving else "") + STATE,
             )
+            # tqdm takes the clock of the system, which may jump.
+            self._bar._time = time.monotonic
+            self._bar.start_t = self._bar.last_print_t = time.monotonic()
         if loss is not None:
             self._bar.set_postfix_str(f"loss {loss:.4g}", refresh=False)
         self._bar.total = total  # work may turn out to be more

@@ -2,6 +2,7 @@
 
 import fcntl
 import io
+import itertools
 import os
 import pty
 import re
@@ -93,6 +94,17 @@ def test_plain_lines_now_and_then_where_there_is_no_terminal(monkeypatch, tmp_pa
     monkeypatch.setattr(progress, "PLAIN_INTERVAL", 0.0)
     assert len(lines()) >= 4 and lines()[-1].startswith("gaussians Ball: 5/5, loss 1, ")
     assert "5/5, loss 1" in (tmp_path / "log").read_text()
+
+
+def test_lines_go_on_when_the_clock_jumps_back(monkeypatch):
+    monkeypatch.setattr(progress, "PLAIN_INTERVAL", 0.0)
+    hours = itertools.count(0, -3600)
+    monkeypatch.setattr("tqdm.std.time", lambda: float(next(hours)))
+    stream = io.StringIO()
+    with progress.stage("gaussians Ball", None, stream) as run:
+        for i in range(5):
+            run.progress(i + 1, 5)
+    assert re.search(r"4/5, 00:00 left", stream.getvalue())
 
 
 @pytest.mark.parametrize(
