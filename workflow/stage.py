@@ -16,7 +16,7 @@ import resource
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TextIO
@@ -25,6 +25,7 @@ from tqdm import tqdm
 
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.extensions import load_laws
+from neuma_lib.io.files import unwritable
 from workflow.manager import end_with_snakemake
 
 PLAIN_INTERVAL = 15.0  # seconds between plain lines
@@ -55,7 +56,7 @@ def stage(name: str, log: str | Path | None = None, stream: TextIO | None = None
     handlers: list[logging.Handler] = [_Terminal(run)]
     if log:
         Path(log).parent.mkdir(parents=True, exist_ok=True)
-        handlers.append(logging.FileHandler(log, "w"))
+        handlers.append(_Log(log, "w"))
         handlers[-1].setFormatter(logging.Formatter(LOG_FORMAT))
     for handler in handlers:
         root.addHandler(handler)
@@ -140,6 +141,17 @@ class Stage:
             self._terminal.close()
 
 
+class _Log(logging.FileHandler):
+    """A file of messages; those that do not fit on a full disk are lost without an error."""
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        pass
+
+    def close(self) -> None:
+        with suppress(OSError):
+            super().close()
+
+
 class _Terminal(logging.Handler):
     """Shows messages of the stage and warnings of the library above the moving bar."""
 
@@ -167,6 +179,8 @@ def _locked_terminal(stream: TextIO) -> TextIO | None:
 def _plain(error: BaseException) -> str:
     if isinstance(error, InputError | NonFiniteError):
         return str(error)
+    if full := unwritable(error):
+        return str(full)
     if isinstance(error, KeyboardInterrupt):
         return "interrupted; run the same command again to go on"
     return f"{type(error).__name__}: {error}"

@@ -39,9 +39,9 @@ def atomic(path: str | Path) -> Iterator[Path]:
         yield partial
         os.replace(partial, path)
     except (OSError, RuntimeError) as error:
-        if (number := _number(error)) not in _REMEDIES:
-            raise
-        raise InputError(path, f"cannot be written: {os.strerror(number)}", _REMEDIES[number]) from None
+        if full := unwritable(error, path):
+            raise full from None
+        raise
     finally:
         with suppress(OSError):  # of a read-only file system, even if there is no such file
             partial.unlink(missing_ok=True)
@@ -55,10 +55,18 @@ _REMEDIES = {
 }
 
 
-def _number(error: OSError | RuntimeError) -> int | None:
-    """Error number of the operating system. HDF5 gives it in the text of a RuntimeError."""
-    found = re.search(r"errno = (\d+)", str(error))
-    return int(found[1]) if found else getattr(error, "errno", None)
+def unwritable(error: BaseException, path: str | Path | None = None) -> InputError | None:
+    """The error of a full disk or of a read-only folder as an `InputError`; None for other errors.
+
+    Args:
+        path: the file that was written, if the error does not name it.
+    """
+    found = re.search(r"errno = (\d+)", str(error))  # HDF5 raises a RuntimeError
+    number = int(found[1]) if found else getattr(error, "errno", None)
+    if number not in _REMEDIES:
+        return None
+    where = path or getattr(error, "filename", None) or "output"
+    return InputError(where, f"cannot be written: {os.strerror(number)}", _REMEDIES[number])
 
 
 def write_text(path: str | Path, text: str) -> None:
