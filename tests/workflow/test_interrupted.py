@@ -33,7 +33,7 @@ def test_runs_killed_at_random_moments_end_with_the_same_files(finished, kernels
         while True:
             snakemake = project.start(*TARGETS)
             try:
-                code = snakemake.wait(moments.uniform(2.0, LONGEST))
+                code = snakemake.wait(moments.uniform(2.0, LONGEST) if kills < KILLS else project.seconds)
             except subprocess.TimeoutExpired:
                 moments.choice([os.kill, os.killpg])(snakemake.pid, signal.SIGKILL)
                 snakemake.wait()
