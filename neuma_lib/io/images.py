@@ -279,7 +279,7 @@ def open_image(content: bytes, where: str | Path, sha256: str | None = None) -> 
         if image.width * image.height > MAX_PIXELS:
             raise ValueError(f"{image.width}x{image.height} pixels exceed the maximum of {MAX_PIXELS}")
     if image.mode.startswith(("I", "F")):
-        raise InputError(where, "has more than 8 bits per channel", "Convert it to 8 bits per channel")
+        raise InputError(where, "has 16 bits per channel or more", "Convert it to 8 bits per channel")
     if image.format != "MPO" and getattr(image, "is_animated", False):  # MPO: a photograph with its preview
         raise InputError(where, "is an animation", "Save one of its pictures")
     return image

@@ -446,9 +446,11 @@ def test_released_cameras(tmp_path, row, column, value):
     pose[row, column] = value
     path = tmp_path / "data_dynamic.json"
     path.write_text(
-        json.dumps([{"file_path": "r_0_0.png", "c2w": pose.tolist(), "intrinsic": np.eye(3).tolist()}])
+        json.dumps(
+            [{"file_path": "r_0_0.png", "c2w": pose.tolist(), "intrinsic": [[9, 0, 2], [0, 9, 2], [0, 0, 1]]}]
+        )
     )
-    refused(read_image_set, path, "c2w")
+    refused(read_image_set, path, "transform_matrix")
 
 
 GREY16 = Image.fromarray(np.full((4, 4), 300, np.uint16))

@@ -56,13 +56,12 @@ def camera(entry: Mapping[str, Any], where: str, intrinsic: str = "intrinsic") -
     pose, K = matrix_of_numbers(entry.get("c2w")), matrix_of_numbers(entry.get(intrinsic))
     if pose.shape not in [(4, 4), (3, 4)]:
         raise InputError(f"{where}: c2w", "must be a 4x4 matrix of numbers")
-    check_pose(np.vstack([pose, [[0, 0, 0, 1]]])[:4], f"{where}: c2w")
     if K.shape != (3, 3):
         raise InputError(f"{where}: {intrinsic}", "must be a 3x3 matrix of numbers")
     if not np.abs(K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]] - [0, 0, 0, 0, 1]).max() <= 1e-9:
         raise InputError(f"{where}: {intrinsic}", "must be that of a pinhole camera without skew")
     return {
-        "transform_matrix": [*pose[:3].tolist(), [0.0, 0.0, 0.0, 1.0]],
+        "transform_matrix": [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]][:4],
         **{"fl_x": K[0, 0].item(), "fl_y": K[1, 1].item(), "cx": K[0, 2].item(), "cy": K[1, 2].item()},
     }
 
