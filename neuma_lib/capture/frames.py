@@ -20,10 +20,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from neuma_lib.capture.pictures import picture_sheet
+from neuma_lib.capture.tools import ffmpeg_input
 from neuma_lib.errors import InputError
-from neuma_lib.extras import require
 from neuma_lib.io.files import existing, one_line
 from neuma_lib.io.images import MAX_PIXELS
+from neuma_lib.io.processes import start_child
 
 MAX_FRAMES = 100_000
 """Frames of a video that are accepted: a quarter of an hour at 120 per second."""
@@ -246,14 +247,11 @@ def _decoder(path: str | Path, pixels: bool) -> Iterator[_Decoder]:
     if path.stat().st_size == 0:
         raise InputError(path, "the file is empty", _AGAIN)
     output = ["-f", "rawvideo", "-pix_fmt", "rgb24", "pipe:1"] if pixels else ["-f", "null", "-"]
-    # The prefix file: keeps a file name from being parsed as a protocol, and V excludes cover pictures. ffmpeg rotates
-    # pictures upright before they reach a filter.
-    options = "-hide_banner -nostdin -xerror -protocol_whitelist file".split()
-    ffmpeg = require("imageio_ffmpeg", "capture").get_ffmpeg_exe()
-    command = [ffmpeg, *options, "-i", f"file:{path.resolve()}", "-map", "0:V:0"]
+    # V excludes cover pictures. ffmpeg rotates pictures upright before they reach a filter.
+    command = [*ffmpeg_input(path, "-hide_banner", "-xerror"), "-map", "0:V:0"]
     command += ["-vf", "showinfo=checksum=0", "-fps_mode", "passthrough", "-threads", "1", *output]
     stdout = subprocess.PIPE if pixels else subprocess.DEVNULL
-    process = subprocess.Popen(command, stdout=stdout, stderr=subprocess.PIPE)
+    process = start_child(command, stdout=stdout, stderr=subprocess.PIPE)
     try:
         yield _Decoder(path, process)
     finally:

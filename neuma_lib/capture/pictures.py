@@ -17,7 +17,7 @@ from PIL import Image, ImageDraw, ImageFont
 from neuma_lib.capture.calibration.lens import Lens
 from neuma_lib.capture.tools import opencv
 from neuma_lib.errors import InputError
-from neuma_lib.io.files import atomic, reading
+from neuma_lib.io.files import atomic, read_regular, reading
 from neuma_lib.io.images import open_image
 
 ORIENTATION = 0x0112
@@ -51,7 +51,7 @@ def name_pictures(groups: Mapping[str, Sequence[Path]]) -> dict[str, Path]:
 
 def picture_size(file: Path) -> tuple[int, int]:
     """Width and height in sensor orientation [px]. Raises InputError for a file that is no picture."""
-    with open_image(file.read_bytes(), file) as image:
+    with open_image(read_regular(file), file) as image:
         return image.size
 
 
@@ -59,7 +59,7 @@ def copy_pictures(pictures: Mapping[str, Path], target: str | Path) -> dict[str,
     """Copy pictures by name to <target>/<name>, without EXIF orientation. Raises InputError for damaged files."""
     copies = {name: Path(target) / name for name in pictures}
     for name, file in pictures.items():
-        content = file.read_bytes()
+        content = read_regular(file)
         with open_image(content, file) as image:
             rotated = image.getexif().get(ORIENTATION, 1) != 1
             with atomic(copies[name]) as partial:
@@ -96,7 +96,7 @@ def _reset_orientation(content: bytes, exif: bytes) -> bytes:
 
 def read_picture(file: str | Path) -> np.ndarray:
     """RGB (H, W, 3), uint8, in sensor orientation."""
-    with open_image(Path(file).read_bytes(), file) as image, reading(file, "an image"):
+    with open_image(read_regular(file), file) as image, reading(file, "an image"):
         return np.asarray(image.convert("RGB"))
 
 

@@ -1,4 +1,4 @@
-"""Optional packages for captures: OpenCV, COLMAP and Matplotlib."""
+"""Optional packages for captures: OpenCV, COLMAP, ffmpeg and Matplotlib."""
 
 from __future__ import annotations
 
@@ -13,6 +13,9 @@ from neuma_lib.io.files import atomic
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+# Demuxers of ffmpeg that read one file. Others, such as dash, hls and concat, open files that their input names.
+_CONTAINERS = "mov,matroska,avi,mpegts,mpeg,mpegvideo,h264,hevc,flv,ogg,asf,wav,flac,mp3,aac"
 
 
 def opencv() -> ModuleType:
@@ -40,3 +43,19 @@ def save_figure(path: str | Path, figure: Figure) -> None:
     canvas = require("matplotlib.backends.backend_agg", "capture").FigureCanvasAgg(figure)
     with atomic(path) as partial:
         canvas.print_png(partial, metadata={"Software": None})
+
+
+def ffmpeg_input(path: Path, *options: str) -> list[str]:
+    """Command of ffmpeg with a video file as its input. Manifests and lists of other files are refused.
+
+    Args:
+        path: the file.
+        options: global options.
+
+    Raises:
+        InputError: imageio-ffmpeg is not installed.
+    """
+    ffmpeg = require("imageio_ffmpeg", "capture").get_ffmpeg_exe()
+    # The prefix file: keeps a file name from being parsed as a protocol.
+    limits = ["-protocol_whitelist", "file", "-format_whitelist", _CONTAINERS]
+    return [ffmpeg, "-nostdin", *options, *limits, "-i", f"file:{path.resolve()}"]

@@ -119,8 +119,18 @@ def existing(path: str | Path, remedy: str = "Run the stage that writes it, or c
     """The path of a file. Raises InputError if it does not exist."""
     path = Path(path)
     if not path.is_file():
+        if path.exists():
+            raise InputError(path, "is not a regular file", remedy)
         raise InputError(path, "does not exist", remedy)
     return path
+
+
+def read_regular(path: str | Path, limit: int = 2**28) -> bytes:
+    """Content of a regular file of at most ``limit`` bytes. Raises InputError for others, which may never end."""
+    path = existing(path, "Put the file there, or correct its name")
+    if path.stat().st_size > limit:
+        raise InputError(path, f"is larger than {limit} bytes", "Replace it by a smaller file")
+    return path.read_bytes()
 
 
 def zip_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, limit: int) -> bytes:

@@ -17,8 +17,8 @@ import torch
 from PIL import Image
 
 from neuma_lib.errors import InputError
-from neuma_lib.io.datasets.released import image_name, matrix_of_numbers, released_frames
-from neuma_lib.io.files import one_line, read_json, reading, sha256_file, write_json
+from neuma_lib.io.datasets.released import check_pose, image_name, matrix_of_numbers, released_frames
+from neuma_lib.io.files import one_line, read_json, read_regular, reading, sha256_file, write_json
 from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.observation import Observation, exposed_steps
 
@@ -54,6 +54,8 @@ FORMATS = ("PNG", "JPEG", "WEBP")
 """Supported image formats, by Pillow's names. Decoders of other formats are less well tested."""
 MAX_PIXELS = 2**26
 """Maximum size of an image: 8192 x 8192 pixels, 256 MiB of RGBA."""
+MAX_INTRINSIC = 1e7
+"""Limit of focal lengths, principal points and image sizes [px]."""
 EXPOSURE_SAMPLES = 5
 """Default maximum number of renders that are averaged to a frame."""
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -140,6 +142,7 @@ def checked_transforms(data: Any, path: str | Path) -> dict[str, Any]:
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not frames:
         raise InputError(f"{path}: frames", "the list is missing or empty")
+    names: set[str] = set()
     for i, frame in enumerate(frames):
         where = f"{path}: frame {i} ({image_name(frame, f'{path}: frame {i}')})"
         _check_intrinsics({**data, **frame}, where)
@@ -155,9 +158,10 @@ def checked_transforms(data: Any, path: str | Path) -> dict[str, Any]:
         pose = matrix_of_numbers(frame.get("transform_matrix"))
         if pose.shape != (4, 4):
             raise InputError(f"{where}: transform_matrix", "must be a 4x4 matrix (camera to world)")
-        rotation = pose[:3, :3]
-        if not np.isfinite(pose).all() or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:
-            raise InputError(f"{where}: transform_matrix", "is not a rigid motion")
+        check_pose(pose, f"{where}: transform_matrix")
+        if (file := os.path.normpath(frame["file_path"])) in names:
+            raise InputError(f"{where}: file_path", "occurs in an earlier frame", "Remove one of them")
+        names.add(file)
     _check_photographs(data, path)
     return data
 
@@ -177,8 +181,10 @@ def _check_intrinsics(values: Mapping[str, Any], where: str) -> None:
         raise InputError(where, "has no intrinsics", remedy)
     for key in ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x"):
         value = values.get(key, 1)
-        if type(value) not in (int, float) or not (0 < value < math.inf):
-            raise InputError(f"{where}: {key}", f"must be a positive number, not {one_line(repr(value))}")
+        limit = math.pi if key == "camera_angle_x" else MAX_INTRINSIC
+        if type(value) not in (int, float) or not (0 < value < limit):
+            problem = f"must be a positive number below {limit:g}, not {one_line(repr(value))}"
+            raise InputError(f"{where}: {key}", problem)
     if values.get("w", 1) * values.get("h", 1) > MAX_PIXELS:
         problem = f"{values['w']} x {values['h']} pixels exceed the maximum of {MAX_PIXELS}"
         raise InputError(f"{where}: w, h", problem)
@@ -243,7 +249,7 @@ def image_file(folder: Path, name: str, listed_in: str | Path) -> Path:
 
 def _read_all(files: Sequence[Path], frames: Sequence[Mapping[str, Any]], path: str | Path) -> np.ndarray:
     """Images of one size (K, H, W, 4), on all cores: decoding and checksums release Python's global lock."""
-    with open_image(files[0].read_bytes(), files[0]) as image:
+    with open_image(read_regular(files[0]), files[0]) as image:
         width, height = image.size
     for frame in frames:
         w, h = frame.get("w", width), frame.get("h", height)
@@ -272,7 +278,11 @@ def open_image(content: bytes, where: str | Path, sha256: str | None = None) -> 
         image = Image.open(BytesIO(content), formats=FORMATS)
         if image.width * image.height > MAX_PIXELS:
             raise ValueError(f"{image.width}x{image.height} pixels exceed the maximum of {MAX_PIXELS}")
-        return image
+    if image.mode.startswith(("I", "F")):
+        raise InputError(where, "has 16 bits per channel or more", "Convert it to 8 bits per channel")
+    if image.format != "MPO" and getattr(image, "is_animated", False):  # MPO: a photograph with its preview
+        raise InputError(where, "is an animation", "Save one of its pictures")
+    return image
 
 
 def read_rgba(path: Path, sha256: str | None, size: tuple[int, int] | None) -> np.ndarray:
@@ -281,11 +291,9 @@ def read_rgba(path: Path, sha256: str | None, size: tuple[int, int] | None) -> n
     Raises:
         InputError: damaged, of another size, without alpha, with 16 bits per channel, or with an empty mask.
     """
-    with open_image(path.read_bytes(), path, sha256) as image:
+    with open_image(read_regular(path), path, sha256) as image:
         if size is not None and image.size != size:
             raise InputError(path, "is {}x{}, but expected {}x{}".format(*image.size, *size))
-        if image.mode in ("I;16", "I"):
-            raise InputError(path, "has 16 bits per channel", "Convert it to 8-bit RGBA")
         with reading(path, "an image"):
             image.load()
             has_alpha = "A" in image.mode or "transparency" in image.info

@@ -5,6 +5,7 @@ import pytest
 from PIL import Image
 
 from neuma_lib.capture import frames
+from neuma_lib.capture.motion.timing import read_sound
 from neuma_lib.errors import InputError
 from tests.support.errors import refused
 from tests.support.films import SIZE, TICKS, ffmpeg, film
@@ -154,3 +155,24 @@ def test_contact_sheet(tmp_path, variable):
     with refused("c.png"):
         frames.contact_sheet(tmp_path / "c.png", [], "none")
     assert not (tmp_path / "c.png").exists()
+
+
+MANIFESTS = {
+    "hls": "#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\n{}\n#EXT-X-ENDLIST\n",
+    "concat": "ffconcat version 1.0\nfile {}\n",
+    "dash": '<MPD xmlns="urn:mpeg:dash:schema:mpd:2011" type="static" profiles="urn:mpeg:dash:profile:isoff-on-demand:2011"'  # noqa: E501
+    ' mediaPresentationDuration="PT1S"><Period>'
+    '<AdaptationSet mimeType="video/mp4"><Representation id="0" bandwidth="1"><BaseURL>{}</BaseURL>'
+    "</Representation></AdaptationSet></Period></MPD>",
+}
+
+
+@pytest.mark.parametrize("text", MANIFESTS.values(), ids=MANIFESTS)
+@pytest.mark.parametrize("read", [frames.read_timeline, read_sound])
+def test_manifests_read_no_other_file(variable, read, text):
+    """A video that decodes is next to a manifest that names it."""
+    other, _ = variable
+    path = other.with_name("manifest.mp4")
+    path.write_text(text.format(other.name))
+    with refused(path):
+        read(path)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.io import wavfile
 
+from neuma_lib.capture.motion import timing
 from neuma_lib.capture.motion.timing import (
     RATE,
     Offset,
@@ -70,3 +71,13 @@ def test_sound_keeps_the_clock_of_its_video(tmp_path):
         read_sound(tmp_path / "c.mp4")
     with refused("d.mp4"):
         read_sound(tmp_path / "d.mp4")
+
+
+def test_sound_of_hours_is_refused_before_it_is_decoded(tmp_path, monkeypatch):
+    """The decoder stops at the limit: 20 s of sound give 2 s of samples."""
+    path = tmp_path / "long.flac"
+    ffmpeg("-f", "lavfi", "-i", "anullsrc=r=16000:cl=mono", "-t", 20, path)
+    assert len(read_sound(path)) == 20 * RATE
+    monkeypatch.setattr(timing, "MAX_SOUND", 1)
+    with refused(path, problem="longer than 1 s"):
+        read_sound(path)

@@ -1,6 +1,7 @@
 """Bad files end in one line that names the file. Nothing is written, and headers cannot claim memory."""
 
 import json
+import os
 import pickle
 import struct
 import tracemalloc
@@ -16,6 +17,8 @@ import torch
 from PIL import Image
 from safetensors.torch import save, save_file
 
+from neuma_lib.capture.masks.regions import read_mask
+from neuma_lib.capture.pictures import read_picture
 from neuma_lib.errors import InputError
 from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.io.gaussians import load_gaussians
@@ -394,3 +397,89 @@ def test_adaptors(tmp_path, metadata):
     path = tmp_path / "bad.safetensors"
     save_file({"x": torch.zeros(2)}, path, {"neuma": json.dumps(metadata)})
     refused(lambda p: load_law(tmp_path / "prior.safetensors", p), path)
+
+
+# ---- Cameras and pictures
+
+
+def camera_list(path, change):
+    """A transforms.json of one image, changed by ``change(data, frame)``."""
+    Image.fromarray(np.full((4, 4, 4), 255, np.uint8)).save(path.parent / "0.png")
+    frame = {"file_path": "0.png", "transform_matrix": np.eye(4).tolist(), "view": 0, "step": 0}
+    data = {"camera_angle_x": 0.7, "frames": [frame]}
+    change(data, frame)
+    path.write_text(json.dumps(data))
+    return path
+
+
+def entry(row, column, value):
+    def change(data, frame):
+        frame["transform_matrix"][row][column] = value
+
+    return change
+
+
+CAMERAS = {
+    "mirrored": entry(0, 0, -1),
+    "last row": entry(3, 0, 0.5),
+    "homogeneous scale": entry(3, 3, 2),
+    "not orthonormal": entry(0, 1, 0.1),
+    "far away": entry(0, 3, 1e308),
+    "field of view of pi": lambda data, frame: data.update(camera_angle_x=np.pi),
+    "field of view of 0": lambda data, frame: data.update(camera_angle_x=0),
+    "focal length": lambda data, frame: data.update(fl_x=1e308),
+    "same image 20 times": lambda data, frame: data.update(frames=[frame] * 20),
+    "same image by another path": lambda data, frame: data["frames"].append(
+        {**frame, "file_path": "./0.png"}
+    ),
+}
+
+
+@pytest.mark.parametrize("change", CAMERAS.values(), ids=CAMERAS)
+def test_cameras(tmp_path, change):
+    refused(read_image_set, camera_list(tmp_path / "transforms.json", change))
+
+
+@pytest.mark.parametrize("row, column, value", [(0, 0, -1), (3, 0, 0.5), (0, 3, 1e308)])
+def test_released_cameras(tmp_path, row, column, value):
+    pose = np.eye(4)
+    pose[row, column] = value
+    path = tmp_path / "data_dynamic.json"
+    path.write_text(
+        json.dumps(
+            [{"file_path": "r_0_0.png", "c2w": pose.tolist(), "intrinsic": [[9, 0, 2], [0, 9, 2], [0, 0, 1]]}]
+        )
+    )
+    refused(read_image_set, path, "transform_matrix")
+
+
+GREY16 = Image.fromarray(np.full((4, 4), 300, np.uint16))
+PICTURES = {
+    "16 bits": lambda path: GREY16.save(path),
+    "animation": lambda path: Image.new("RGB", (4, 4)).save(
+        path, save_all=True, append_images=[Image.new("RGB", (4, 4), "red")]
+    ),
+    "pipe": os.mkfifo,
+    "folder": lambda path: path.mkdir(),
+    "sparse file": lambda path: os.truncate(os.open(path, os.O_CREAT | os.O_WRONLY), 2**32),
+    "60,000 x 60,000 pixels": lambda path: path.write_bytes(huge_png()),
+}
+
+
+def huge_png():
+    """Header of a PNG."""
+    chunks = [b"IHDR" + struct.pack(">IIBBBBB", 60_000, 60_000, 8, 2, 0, 0, 0), b"IDAT", b"IEND"]
+    body = b"".join(struct.pack(">I", len(c) - 4) + c + struct.pack(">I", zlib.crc32(c)) for c in chunks)
+    return b"\x89PNG\r\n\x1a\n" + body
+
+
+@pytest.mark.parametrize("write", PICTURES.values(), ids=PICTURES)
+@pytest.mark.parametrize(
+    "read", [read_picture, lambda path: read_mask(path, (4, 4))], ids=["picture", "mask"]
+)
+def test_pictures(tmp_path, read, write):
+    path = tmp_path / "picture.png"
+    write(path)
+    with pytest.raises(InputError, match="picture.png") as caught:
+        read(path)
+    assert len(str(caught.value).splitlines()) == 1

@@ -14,7 +14,7 @@ from scipy import ndimage
 from neuma_lib.capture.frames import Frame
 from neuma_lib.capture.tools import opencv
 from neuma_lib.errors import InputError
-from neuma_lib.io.files import existing, reading
+from neuma_lib.io.files import existing, read_regular, reading
 from neuma_lib.io.images import open_image
 
 _MIN_AREA = 2e-5  # minimum area of an object, as share of the picture
@@ -87,7 +87,7 @@ def read_mask(path: str | Path, size: tuple[int, int]) -> np.ndarray:
     Raises:
         InputError: missing, damaged, of another size, or empty.
     """
-    content = existing(path, "Put the mask there, or remove it from the settings").read_bytes()
+    content = read_regular(existing(path, "Put the mask there, or remove it from the settings"))
     with open_image(content, path) as image, reading(path, "a mask"):
         image.load()
         has_alpha = "A" in image.mode or "transparency" in image.info

@@ -12,12 +12,15 @@ from pathlib import Path
 import numpy as np
 from scipy import signal
 
+from neuma_lib.capture.tools import ffmpeg_input
 from neuma_lib.errors import InputError
-from neuma_lib.extras import require
 from neuma_lib.io.files import existing, one_line
+from neuma_lib.io.processes import start_child
 
 RATE = 16_000
 """Sampling rate of the compared sound [Hz]."""
+MAX_SOUND = 1800
+"""Maximum duration of the sound of a video [s]: 115 MB at `RATE`."""
 _BAND = (300.0, 6000.0)  # band of claps and impacts, above hum and below the filters of phones [Hz]
 SOUND_SPREAD = 0.005
 """Standard deviation of an offset due to the travel time of sound, 2.9 ms per metre, and delays in phones [s]."""
@@ -37,17 +40,23 @@ class Offset:
 def read_sound(path: str | Path) -> np.ndarray | None:
     """The sound of a video, mono at `RATE`, (N,), float32. None without sound. Raises InputError if it is no video."""
     path = existing(path, "Put the video there, or correct its name")
-    ffmpeg = require("imageio_ffmpeg", "capture").get_ffmpeg_exe()
-    command = [ffmpeg, "-v", "error", "-nostdin", "-protocol_whitelist", "file,pipe"]
     # first_pts=0 keeps the clock that sound and picture share: sound that starts later is preceded by silence.
-    command += ["-i", f"file:{path}", "-map", "0:a:0?", "-af", "aresample=async=1:first_pts=0", "-ac", "1"]
-    done = subprocess.run([*command, "-ar", str(RATE), "-f", "f32le", "pipe:1"], capture_output=True)
-    message = done.stderr.decode(errors="replace")
-    if done.returncode and "does not contain any stream" not in message:
+    command = [*ffmpeg_input(path, "-v", "error"), "-map", "0:a:0?", "-af", "aresample=async=1:first_pts=0"]
+    command += ["-ac", "1", "-ar", str(RATE), "-t", str(MAX_SOUND + 1), "-f", "f32le", "pipe:1"]
+    process = start_child(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    try:
+        sound, errors = process.communicate()
+    finally:
+        process.kill()
+        process.wait()
+    if len(sound) > 4 * RATE * MAX_SOUND:
+        raise InputError(path, f"its sound is longer than {MAX_SOUND} s", "Cut the video to the take")
+    message = errors.decode(errors="replace")
+    if process.returncode and "does not contain any stream" not in message:
         raise InputError(
             path, f"cannot be read as a video ({one_line(message)})", "Copy it from the camera again"
         )
-    return np.frombuffer(done.stdout, np.float32) if done.stdout else None
+    return np.frombuffer(sound, np.float32) if sound else None
 
 
 def offset_from_sound(

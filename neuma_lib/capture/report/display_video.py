@@ -13,6 +13,7 @@ from neuma_lib.capture.masks.background import match_exposure
 from neuma_lib.capture.motion.synchronisation import reduced, reduced_intrinsics
 from neuma_lib.capture.pictures import write_png
 from neuma_lib.errors import InputError
+from neuma_lib.io.files import read_regular
 from neuma_lib.io.images import open_image, read_transforms
 
 
@@ -51,7 +52,7 @@ def display_frames(
     for number, pixels in frames:
         source = listing[number]
         place = Path(mattes).parent / source["file_path"]
-        with open_image(place.read_bytes(), place, source.get("sha256")) as image:
+        with open_image(read_regular(place), place, source.get("sha256")) as image:
             matte = reduced(np.asarray(image.convert("RGBA")), width)
         if pixels.shape != background.shape:
             raise InputError(

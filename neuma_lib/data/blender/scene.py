@@ -25,6 +25,7 @@ from neuma_lib.data.blender.libraries import explain_import_error
 from neuma_lib.errors import InputError
 from neuma_lib.io.gltf import linear
 from neuma_lib.io.images import write_transforms
+from neuma_lib.io.processes import start_child
 from neuma_lib.splatting.viewpoints import Views
 
 Progress = Callable[[int, int], None]
@@ -177,7 +178,7 @@ def run_worker(module: str, job: Path, total: int = 0, progress: Progress | None
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(packages)}
     log = job.with_suffix(".log")
     with open(log, "wb") as sink:
-        process = subprocess.Popen(
+        process = start_child(
             [python, "-m", module, str(job)], stdout=subprocess.PIPE, stderr=sink, env=environment, text=True
         )
         try:

@@ -22,7 +22,7 @@ from PIL import Image
 
 from neuma_lib.errors import InputError
 from neuma_lib.io.datasets.released import camera, image_name
-from neuma_lib.io.files import atomic, read_json, reading
+from neuma_lib.io.files import atomic, read_json, read_regular, reading
 from neuma_lib.io.images import (
     ImageSet,
     checked_transforms,
@@ -200,7 +200,7 @@ def _masked(file: Path, background: Path | None) -> np.ndarray | None:
 def _rgba(file: Path) -> np.ndarray:
     if not file.is_file():
         raise InputError(file, "is listed but does not exist", "Add it, or remove it from the list")
-    with open_image(file.read_bytes(), file) as image, reading(file, "an image"):
+    with open_image(read_regular(file), file) as image, reading(file, "an image"):
         return np.array(image.convert("RGBA"))
 
 

@@ -16,6 +16,8 @@ import numpy as np
 
 from neuma_lib.errors import InputError
 
+MAX_POSITION = 1e6
+"""Maximum coordinate of a camera [m]."""
 _NAME = re.compile(r"[a-z]+_(\d{1,9})_(\d{1,9})$", re.IGNORECASE)
 
 
@@ -59,9 +61,20 @@ def camera(entry: Mapping[str, Any], where: str, intrinsic: str = "intrinsic") -
     if not np.abs(K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]] - [0, 0, 0, 0, 1]).max() <= 1e-9:
         raise InputError(f"{where}: {intrinsic}", "must be that of a pinhole camera without skew")
     return {
-        "transform_matrix": [*pose[:3].tolist(), [0.0, 0.0, 0.0, 1.0]],
+        "transform_matrix": [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]][:4],
         **{"fl_x": K[0, 0].item(), "fl_y": K[1, 1].item(), "cx": K[0, 2].item(), "cy": K[1, 2].item()},
     }
+
+
+def check_pose(pose: np.ndarray, where: str) -> None:
+    """Raise InputError if a pose (4, 4), camera to world, is no rigid motion or is further away than `MAX_POSITION`."""
+    rotation = pose[:3, :3]
+    if not np.abs(pose).max() <= MAX_POSITION:
+        raise InputError(where, f"has entries that are not finite or exceed {MAX_POSITION:g} m")
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
+        raise InputError(where, "is not a rigid motion: its rotation is not orthonormal, or is mirrored")
+    if np.abs(pose[3] - [0, 0, 0, 1]).max() > 1e-6:
+        raise InputError(where, "is not a rigid motion: its last row must be 0, 0, 0, 1")
 
 
 def image_name(entry: Any, where: str) -> str:
