@@ -9,6 +9,7 @@ import pytest
 import torch
 import trimesh
 from PIL import Image, ImageDraw
+from pydantic import ValidationError
 
 from neuma_lib.config.blender import AppearanceConfig
 from neuma_lib.data.blender.appearance import colors_at, smooth_noise
@@ -88,8 +89,8 @@ def test_colors_name_what_is_wrong():
     assert "beek" in error.value.problem
     with refused("colors"):
         colors_at(mesh, mesh.vertices, AppearanceConfig(colors={"beak": "#000000"}))
-    with refused("colors"):
-        colors_at(mesh, mesh.vertices, AppearanceConfig(colors={"body": "yellow"}))
+    with pytest.raises(ValidationError, match="colors.body"):
+        AppearanceConfig(colors={"body": "yellow"})
 
 
 def test_a_mesh_has_the_colour_of_the_body_and_ignores_parts():

@@ -19,8 +19,8 @@ from neuma_lib.io.processes import start_child
 
 RATE = 16_000
 """Sampling rate of the compared sound [Hz]."""
-MAX_SOUND = 1800
-"""Maximum duration of the sound of a video [s]: 115 MB at `RATE`."""
+MAX_SOUND = 3600
+"""Maximum duration of the sound of a video [s]: 230 MB at `RATE`."""
 _BAND = (300.0, 6000.0)  # band of claps and impacts, above hum and below the filters of phones [Hz]
 SOUND_SPREAD = 0.005
 """Standard deviation of an offset due to the travel time of sound, 2.9 ms per metre, and delays in phones [s]."""
