@@ -131,14 +131,14 @@ def load_initial_state(
     together = load_reconstruction(particles, binding, gaussians, 1.0, particle_source)
     x0, vol0 = together.x0, together.vol0
     motion = _initial_motion(velocity)
-    parts = motion.get("bodies", [{**motion, "particles": len(x0)}])
+    parts = motion.get("bodies") or [motion]
     if particle_source == "gaussians":
         if len(parts) > 1:
             problem = f"has {len(parts)} bodies, but the Gaussians can be the particles of one body only"
             raise InputError(velocity, problem, "Choose a method that is evaluated on particles")
-        parts = [{**parts[0], "particles": len(x0)}]
-    counts = [part["particles"] for part in parts]
-    if sum(counts) != len(x0) or len(densities) != len(counts):
+    stated = particle_source != "gaussians" and "bodies" in motion
+    counts = [part["particles"] for part in parts] if stated else [len(x0)]
+    if sum(counts) != len(x0) or min(counts) < 1 or len(densities) != len(counts):
         raise InputError(velocity, f"does not have the bodies of {particles}", "Regenerate both")
     return State.joined([
         State.rigid(x, vol * density_at(x, density), vol, *(part[key] for key in INITIAL_MOTION))

@@ -126,14 +126,19 @@ def _hdf5(add) -> None:
         return folder / "figure.h5"
 
     def in_viewer(path: Path) -> None:
-        made = load_reconstruction(*(BODY / name for name in ("particles.h5", "binding.h5", "gaussians.ply")), 1.0)
-        true_motion(path, made, 1e-3)
+        names = ("particles.h5", "binding.h5", "gaussians.ply")
+        true_motion(path, load_reconstruction(*(path.with_name(name) for name in names), 1.0), 1e-3)
+
+    def shown(folder: Path) -> Path:
+        body(folder)
+        return truth(folder)
 
     add("truth.h5", truth, lambda path: read_arrays(path, required=("x", "F")))
     add("rollout.h5", truth, load_motion)
     add("binding.h5", body, read_body)
     add("particles.h5", particles, read_body)
     add("velocity.json", velocity, read_start, is_text=True)
+    add("truth.h5 (viewer)", shown, in_viewer, is_slow=True)
     add("figure.h5", pictures, load_image_grid)
 
 
@@ -164,7 +169,7 @@ def _weights(add) -> None:
 
     def springs(folder: Path) -> Path:
         x = torch.rand(30, 3, generator=torch.Generator().manual_seed(0))
-        body = SpringBody.of(x, 12, 4, 2, 0.5, 3)
+        body = SpringBody.of(x, 12, 4, 2, 0.5, 4)
         save_springs(folder / "springs.safetensors", body, Springs(body.network, 1.0, 1.0), {"stable": True})
         return folder / "springs.safetensors"
 
@@ -350,7 +355,7 @@ def _pictures(add) -> None:
         take_video(path, path.parent / "taken/transforms.json", [0, 10], 10)
 
     add("transforms.json", image_set, read_set, is_text=True)
-    add("transforms.json (photographs)", mattes, lambda p: load_static(p, PhotographsConfig()), is_text=True)
+    add("transforms.json (photographs)", mattes, lambda p: load_static(p, PhotographsConfig(lacking=1.0)), is_text=True)
     add("matte.png", matte_file, read_set)
     for suffix in (".png", ".jpg", ".webp"):
         add(f"photograph{suffix}", photograph(suffix), read_photograph)
@@ -372,8 +377,7 @@ def _films(add) -> None:
 
 def _others(add) -> None:
     def capture(folder: Path) -> Path:
-        text = "scale: {length: 0.2, between: [a, b]}\ndensity: 1000\nvideos: {left: {rate: 60}}\n"
-        (folder / "capture.yaml").write_text("density: 1000\n" or text)
+        (folder / "capture.yaml").write_text("board: {square: 0.03}\ndensity: 1000\n")
         return folder / "capture.yaml"
 
     def settings(folder: Path) -> Path:
