@@ -86,7 +86,21 @@ VALUES = [
     "../..", "\0", "\ud800", [], [[]], {}, [None], [0] * 3, [1e308] * 3, ["a"] * 3, {"a": 1}, [[0] * 3] * 3
 ]  # fmt: skip
 NUMBER = re.compile(rb"-?\d+(?:\.\d*)?(?:e[-+]?\d+)?")
-WORDS = [b"0", b"-1", b"4294967296", b"9" * 20, b"9" * 5000, b"1e999", b"nan", b"inf", b"true", b"[]", b'"a"', b"null", b""]
+WORDS = [
+    b"0",
+    b"-1",
+    b"4294967296",
+    b"9" * 20,
+    b"9" * 5000,
+    b"1e999",
+    b"nan",
+    b"inf",
+    b"true",
+    b"[]",
+    b'"a"',
+    b"null",
+    b"",
+]
 
 
 def mutated(content: bytes, rng: random.Random, headers: list[bytes]) -> bytes:
@@ -110,7 +124,9 @@ def mutated(content: bytes, rng: random.Random, headers: list[bytes]) -> bytes:
             data[: len(header)] = header
         elif kind == 5:
             length = rng.choice((1, 7, 64, 1000))
-            data[at : at + rng.choice((0, length))] = rng.choice((b"\0", b"\xff", bytes(data[:9]) or b"a")) * length
+            data[at : at + rng.choice((0, length))] = (
+                rng.choice((b"\0", b"\xff", bytes(data[:9]) or b"a")) * length
+            )
         elif kind == 6:
             del data[at : at + rng.choice((1, 4, 100))]
         elif numbers := list(NUMBER.finditer(data, max(0, at - 200), at + 200)):
@@ -222,7 +238,13 @@ def _batch(reader, numbers, content, headers, outcome: Outcome, verbose: bool) -
     outcome.peak = max(outcome.peak, usage.ru_maxrss * 1024)
     if done < len(numbers):
         signalled = os.WTERMSIG(status) if os.WIFSIGNALED(status) else 0
-        what = "slow" if signalled == signal.SIGALRM else f"crash: {signal.Signals(signalled).name}" if signalled else "exit"
+        what = (
+            "slow"
+            if signalled == signal.SIGALRM
+            else f"crash: {signal.Signals(signalled).name}"
+            if signalled
+            else "exit"
+        )
         outcome.add(what, numbers[done], float(SECONDS) if what == "slow" else 0.0)
         done += 1
     return done
@@ -247,14 +269,19 @@ def _work(reader, numbers, content, headers, sink, verbose: bool) -> None:
             what = "read"
         except InputError as error:
             cause = error.__context__
-            lines = len(str(error).splitlines())
-            what = "memory" if isinstance(cause, MemoryError) else "refused" if lines == 1 else "several lines"
+            # all wrong settings are listed together
+            is_clear = reader.path.suffix == ".yaml" or len(str(error).splitlines()) == 1
+            what = "memory" if isinstance(cause, MemoryError) else "refused" if is_clear else "several lines"
         except MemoryError:
             what = "memory"
         except BaseException as error:
-            what = f"{type(error).__name__}: {' '.join(str(error).split())[:60]}"
             frames = [f for f in traceback.extract_tb(error.__traceback__) if "neuma_lib" in f.filename]
-            what += f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
+            what = (
+                f"{type(error).__name__} in {Path(frames[-1].filename).name}:{frames[-1].lineno}"
+                if frames
+                else repr(error)
+            )
+            what = " ".join(what.split())[:100]
             if verbose:
                 traceback.print_exc()
         signal.alarm(0)
@@ -283,7 +310,9 @@ def main() -> int:
     parser.add_argument("--mutations", type=int, default=200, help="of each reader (default %(default)s)")
     parser.add_argument("--first", type=int, default=0, help="number of the first mutation")
     parser.add_argument("--only", nargs="*", help="parts of the names of readers")
-    parser.add_argument("--slow-share", type=float, default=0.1, help="share of the mutations for slow readers")
+    parser.add_argument(
+        "--slow-share", type=float, default=0.1, help="share of the mutations for slow readers"
+    )
     parser.add_argument("--verbose", action="store_true", help="print tracebacks")
     options = parser.parse_args()
     failed = 0
@@ -300,8 +329,20 @@ def main() -> int:
             found = run(reader, numbers, headers, options.verbose)
             bad = sum(found.counts.values()) - found.counts["read"] - found.counts["refused"]
             failed += bad
-            cells = (reader.name, count, found.counts["read"], found.counts["refused"], bad, f"{found.seconds:.0f}")
-            print("|", " | ".join(map(str, cells)), f"| {found.longest:.2f} | {found.peak / 2**20:.0f} |", flush=True)
+            cells = (
+                reader.name,
+                count,
+                found.counts["read"],
+                found.counts["refused"],
+                bad,
+                f"{found.seconds:.0f}",
+            )
+            print(
+                "|",
+                " | ".join(map(str, cells)),
+                f"| {found.longest:.2f} | {found.peak / 2**20:.0f} |",
+                flush=True,
+            )
             for what, number in found.failures.items():
                 print(f"    {found.counts[what]} x {what}, first in case {number}", flush=True)
     print(f"{failed} failures")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import struct
 from pathlib import Path
 
@@ -28,7 +27,13 @@ from neuma_lib.io.hdf5 import read_arrays, write_arrays
 from neuma_lib.io.images import load_videos, read_image_set
 from neuma_lib.io.laws import load_law, load_prior, save_adaptor, save_law, save_prior
 from neuma_lib.io.mesh import read_mesh, write_mesh
-from neuma_lib.io.particles import load_initial_state, load_motion, load_reconstruction, save_binding, save_particles
+from neuma_lib.io.particles import (
+    load_initial_state,
+    load_motion,
+    load_reconstruction,
+    save_binding,
+    save_particles,
+)
 from neuma_lib.io.photographs import load_static
 from neuma_lib.io.splats import load_splat
 from neuma_lib.io.weights import read_torch, read_weights
@@ -54,7 +59,11 @@ from tests.support.films import ffmpeg, film
 from tests.support.image_layouts import write_pac_nerf, write_spring_gaus
 from tests.support.splat_files import ball, write_splat, write_spz
 
-LAW = {"elasticity": {"name": "hencky", "E": 1e5, "nu": 0.3}, "plasticity": {"name": "von_mises", "yield_stress": 1e3}}
+ROOT = Path(__file__).resolve().parents[2]
+LAW = {
+    "elasticity": {"name": "hencky", "E": 1e5, "nu": 0.3},
+    "plasticity": {"name": "von_mises", "yield_stress": 1e3},
+}
 
 
 def readers(folder: Path) -> list[Reader]:
@@ -191,7 +200,12 @@ def _weights(add) -> None:
         optimizer = torch.optim.Adam(layer.parameters())
         layer(torch.ones(3)).sum().backward()
         optimizer.step()
-        state = {"weights": layer.state_dict(), "optimizer": optimizer.state_dict(), "losses": [0.5], "best": None}
+        state = {
+            "weights": layer.state_dict(),
+            "optimizer": optimizer.state_dict(),
+            "losses": [0.5],
+            "best": None,
+        }
         Checkpoint(folder / "state.pt", {"commit": "a"}).save(state)
         return folder / "state.pt"
 
@@ -268,7 +282,9 @@ def _json(add) -> None:
         content = {"reprojection_error_px": 0.5, "lost": [], "unsure": {}, "pictures": [picture]}
         write_json(folder / "poses.json", content)
         write_json(folder / "lenses.json", {"left": lens})
-        rows = np.zeros(2, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")])
+        rows = np.zeros(
+            2, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
+        )
         from neuma_lib.io.ply import write_ply
 
         write_ply(folder / "points.ply", rows)
@@ -314,8 +330,12 @@ def _pictures(add) -> None:
         frames = []
         for k in range(4):
             matte(folder / f"{k}.png")
-            frames.append({"file_path": f"{k}.png", "transform_matrix": np.eye(4).tolist(), "view": 0, "step": k})
-        write_json(folder / "transforms.json", {"fl_x": 20.0, "cx": 8.0, "w": 16, "h": 12, "frames": frames, **more})
+            frames.append(
+                {"file_path": f"{k}.png", "transform_matrix": np.eye(4).tolist(), "view": 0, "step": k}
+            )
+        write_json(
+            folder / "transforms.json", {"fl_x": 20.0, "cx": 8.0, "w": 16, "h": 12, "frames": frames, **more}
+        )
         return folder / "transforms.json"
 
     def mattes(folder: Path) -> Path:
@@ -355,7 +375,12 @@ def _pictures(add) -> None:
         take_video(path, path.parent / "taken/transforms.json", [0, 10], 10)
 
     add("transforms.json", image_set, read_set, is_text=True)
-    add("transforms.json (photographs)", mattes, lambda p: load_static(p, PhotographsConfig(lacking=1.0)), is_text=True)
+    add(
+        "transforms.json (photographs)",
+        mattes,
+        lambda p: load_static(p, PhotographsConfig(lacking=1.0)),
+        is_text=True,
+    )
     add("matte.png", matte_file, read_set)
     for suffix in (".png", ".jpg", ".webp"):
         add(f"photograph{suffix}", photograph(suffix), read_photograph)
@@ -381,9 +406,7 @@ def _others(add) -> None:
         return folder / "capture.yaml"
 
     def settings(folder: Path) -> Path:
-        (folder / "config.yaml").write_text(
-            f"scenes:\n  A:\n    shape: ball\n    size: 0.2\n    height: 0.5\n    law: {json.dumps(LAW)}\n"
-        )
+        (folder / "config.yaml").write_bytes((ROOT / "config/config.yaml").read_bytes())
         return folder / "config.yaml"
 
     def cameras(folder: Path) -> Path:
@@ -407,7 +430,7 @@ def _others(add) -> None:
         return folder / "a.ckpt"
 
     add("capture.yaml", capture, read_settings)
-    add("config.yaml", settings, lambda path: load(read_yaml(path), path.parent), is_slow=True)
+    add("config.yaml", settings, lambda path: load(read_yaml(path), ROOT), is_slow=True)
     add("cameras.bin", cameras, released.read_cameras)
     add("images.bin", images, released.read_images)
     add("benchmark.tsv", benchmark, lambda path: timings_table(path.parents[1]))
