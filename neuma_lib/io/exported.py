@@ -98,7 +98,7 @@ def checked_export(metadata: Mapping[str, Any]) -> dict[str, Any]:
 def check_step(where: str, dt: Any) -> None:
     """Raise an `InputError` for a time step that is neither null nor a positive, finite number."""
     if dt is not None and not (type(dt) in (int, float) and 0 < dt < math.inf):
-        raise InputError(where, f"must be a positive number of seconds, not {one_line(dt)}")
+        raise InputError(where, f"{one_line(dt)} must be a positive number of seconds")
 
 
 def fitting_step(about: Mapping[str, Any], dt: float | None, any_time_step: bool = False) -> float | None:

@@ -15,4 +15,6 @@ def test_every_reader_returns_or_refuses(tmp_path):
         assert outcome.counts["read"] + outcome.counts["refused"] > 0
         if outcome.failures:
             failures[reader.name] = outcome.failures
-    assert not failures, "repeat with python -m tests.io.fuzz --only NAME --first CASE --mutations 1 --verbose"
+    assert not failures, (
+        "repeat with python -m tests.io.fuzz --only NAME --first CASE --mutations 1 --verbose"
+    )

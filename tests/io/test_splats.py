@@ -135,6 +135,12 @@ def written(writer, change=lambda data: data, gaussians=None, **options):
 
 
 WITH_NAN = dataclasses.replace(ball(40), means=ball(40).means.index_fill(0, torch.tensor([7]), math.nan))
+FLAT, HUGE = (
+    dataclasses.replace(ball(40), scales=ball(40).scales.index_fill(0, torch.tensor([7]), size))
+    for size in (0.0, math.inf)
+)
+ZEROS = gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, 3, 2**20, 0, 12, 0, 0) + bytes(20 * 2**20), mtime=0)
+"""A million Gaussians in 20 kB."""
 POINTS = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n"
 
 
@@ -144,6 +150,10 @@ POINTS = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header
         ("a.obj", b"v 0 0 0\n", "must end in"),
         ("a.splat", written(write_splat, cut), "multiple of 32"),
         ("a.splat", written(write_splat, gaussians=WITH_NAN), "Gaussian 7 is not finite"),
+        ("a.splat", written(write_splat, gaussians=FLAT), "scale of Gaussian 7 is not positive"),
+        ("a.ply", written(save_gaussians, gaussians=FLAT), "Gaussian 7"),
+        ("a.ply", written(save_gaussians, gaussians=HUGE), "scales of Gaussian 7 is not finite"),
+        ("a.spz", written(lambda path, g: path.write_bytes(ZEROS)), "too many for"),
         ("a.splat", b"", "no Gaussians"),
         ("a.spz", written(write_spz, lambda data: data[:-40]), "ends after"),
         ("a.spz", written(write_spz, count=2**31), "claims"),
