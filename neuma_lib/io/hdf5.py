@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import mmap
 import re
+import struct
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -37,6 +39,8 @@ QUANTITIES = {
 
 INTEGERS = ("frames", "indptr", "indices")
 """Quantities that are indices or counts: integers that are not negative."""
+_HEAP = b"GCOL\1\0\0\0"
+"""Signature and version of a global heap."""
 _MAX_ATTRIBUTE = 2**20
 """Maximum size of an attribute [bytes]."""
 
@@ -74,6 +78,8 @@ def read_arrays(
             that of `QUANTITIES`, a value that is not finite, or a claimed size larger than the stored one.
     """
     path = existing(path)
+    with reading(path, "HDF5"):
+        _check_heaps(path)
     with reading(path, "HDF5"), h5py.File(path, "r") as file:
         if missing := [name for name in required if name not in file.keys()]:
             present = one_line(", ".join(file.keys()))
@@ -89,6 +95,21 @@ def read_arrays(
             if name in INTEGERS:
                 check_indices(name, array)
         return arrays, {key: _attribute(file, key) for key in file.attrs}
+
+
+def _check_heaps(path: Path) -> None:
+    """Check the heaps that hold the texts of attributes. HDF5 does not return from a free space of size 0 in them."""
+    with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        start = content.find(_HEAP)
+        while start >= 0:
+            at, end = start + 16, start + struct.unpack_from("<Q", content, start + 8)[0]
+            while at + 16 <= end:
+                index, length = struct.unpack_from("<H6xQ", content, at)
+                step = 16 + 8 * -(-length // 8) if index else length  # object 0 is free space with its header
+                if step < 16 or at + step > end:
+                    raise ValueError("a heap of texts is damaged")
+                at += step
+            start = content.find(_HEAP, start + 1)
 
 
 def _checked(file: h5py.File, name: str, size: int) -> h5py.Dataset:

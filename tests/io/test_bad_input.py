@@ -199,6 +199,20 @@ def test_other_datasets_are_not_read(tmp_path):
     assert set(read_arrays(path, only=("vol0",))[0]) == {"vol0"}
 
 
+def test_a_heap_of_texts_without_end(tmp_path):
+    """HDF5 does not return from a free space of size 0."""
+    path = tmp_path / "bad.h5"
+    write_arrays(path, {"x": np.zeros((2, 3))}, {"title": "text"})
+    content = bytearray(path.read_bytes())
+    at = content.index(b"GCOL") + 16
+    while index := struct.unpack_from("<H", content, at)[0]:
+        assert index < 10
+        at += 16 + 8 * -(-struct.unpack_from("<Q", content, at + 8)[0] // 8)
+    content[at + 8 : at + 16] = bytes(8)
+    path.write_bytes(content)
+    refused(read_arrays, path, "damaged")
+
+
 def test_binding(tmp_path):
     """Rows and indices that would make a kernel read foreign memory."""
     valid = {"indptr": np.array([0, 2, 3]), "indices": np.array([0, 3, 2]), "values": np.ones(3)}
