@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io as bytes_io
 import pickle
+import pickletools
 import tarfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -187,6 +188,9 @@ def read_plain_pickle(content: bytes, origin: str) -> Any:
         InputError: the pickle names any other class or function, or is damaged.
     """
     with reading(origin, "a pickle of plain arrays"):
+        for opcode, argument, _ in pickletools.genops(content):
+            if "PUT" in opcode.name and argument > len(content):  # allocates a table of this length
+                raise ValueError(f"its {argument} objects are more than it has bytes")
         try:
             return _PlainUnpickler(bytes_io.BytesIO(content)).load()
         except InputError as error:

@@ -1,10 +1,6 @@
 """Seeded mutations of valid files for every reader (see `tests.io.fuzz`)."""
 
-import pytest
-
 from tests.io import fuzz
-
-pytestmark = pytest.mark.core
 
 MUTATIONS = 200
 
