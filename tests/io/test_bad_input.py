@@ -421,11 +421,16 @@ def pickled(opcodes):
     return file.getvalue()
 
 
-NESTED_TUPLES = b"\x80\x02)q\x00" + b"".join(
-    b"h" + bytes([k]) + b"h" + bytes([k]) + b"\x86q" + bytes([k + 1]) for k in range(60)
-)
+NESTED_TUPLES = b")" + b"".join(b"q" + bytes([k]) + b"h" + bytes([k]) + b"\x86" for k in range(60))
 """A tuple of two tuples, which are the same, and so on: 2^60 in 300 bytes."""
-ENCODED = b"\x80\x02c_codecs\nencode\nq\x00X\x02\x00\x00\x00\xc3\xbfX\x05\x00\x00\x00utf-8\x86R."
+ENCODED = (
+    b"\x80\x02"
+    + 28 * b"c_codecs\nencode\n"
+    + b"X\1\0\0\0aX\5\0\0\0ascii\x86R"
+    + 27 * b"X\3\0\0\0hex\x86R"
+    + b"."
+)
+"""Hexadecimal digits of digits: 2^27 bytes from one."""
 LONGER = torch_file({"a": torch.zeros(2)}).replace(b"K\x02tq", b"K\x63tq")
 """A tensor of 99 numbers that stores 2."""
 
@@ -452,7 +457,7 @@ TORCH = {
     "64 MiB deflated, which its header denies": denied(deflated(law_parts(torch.zeros(2)), "data.pkl")),
     "an ordered list": torch_file(OrderedDict(a=1)),
     "an encoder": pickled(ENCODED),
-    "a key of nested tuples": pickled(b"\x80\x02}q\xff" + NESTED_TUPLES[2:] + b"K\x01s."),
+    "a key of nested tuples": pickled(b"\x80\x02}" + NESTED_TUPLES + b"K\1s."),
     "a tensor that is longer than its storage": LONGER,
 }
 
