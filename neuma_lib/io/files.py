@@ -63,8 +63,8 @@ def unwritable(error: BaseException, path: str | Path | None = None) -> InputErr
     Args:
         path: the file that was written, if the error does not name it.
     """
-    found = re.search(r"errno = (\d+)", str(error))  # HDF5 raises a RuntimeError
-    number = int(found[1]) if found else getattr(error, "errno", None)
+    named = re.search(r"errno = (\d+)", str(error))  # HDF5 raises a RuntimeError
+    number = int(named[1]) if named else getattr(error, "errno", None)
     if number not in _REMEDIES:
         return None
     where = path or getattr(error, "filename", None) or "output"

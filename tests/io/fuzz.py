@@ -326,25 +326,25 @@ def main() -> int:
                 continue
             count = max(1, round(options.mutations * (options.slow_share if reader.is_slow else 1)))
             numbers = range(options.first, options.first + count)
-            found = run(reader, numbers, headers, options.verbose)
-            bad = sum(found.counts.values()) - found.counts["read"] - found.counts["refused"]
+            result = run(reader, numbers, headers, options.verbose)
+            bad = sum(result.counts.values()) - result.counts["read"] - result.counts["refused"]
             failed += bad
             cells = (
                 reader.name,
                 count,
-                found.counts["read"],
-                found.counts["refused"],
+                result.counts["read"],
+                result.counts["refused"],
                 bad,
-                f"{found.seconds:.0f}",
+                f"{result.seconds:.0f}",
             )
             print(
                 "|",
                 " | ".join(map(str, cells)),
-                f"| {found.longest:.2f} | {found.peak / 2**20:.0f} |",
+                f"| {result.longest:.2f} | {result.peak / 2**20:.0f} |",
                 flush=True,
             )
-            for what, number in found.failures.items():
-                print(f"    {found.counts[what]} x {what}, first in case {number}", flush=True)
+            for what, number in result.failures.items():
+                print(f"    {result.counts[what]} x {what}, first in case {number}", flush=True)
     print(f"{failed} failures")
     return int(failed > 0)
 

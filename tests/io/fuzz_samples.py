@@ -276,7 +276,7 @@ def _json(add) -> None:
     def read_identified(path: Path) -> None:
         Constants().load({"identified": path}, {}, 1e-3)
 
-    def found_poses(folder: Path) -> Path:
+    def saved_poses(folder: Path) -> Path:
         lens = {"fl_x": 20.0, "fl_y": 20.0, "cx": 8.0, "cy": 6.0, "w": 16, "h": 12}
         picture = {"name": "photographs/a.png", "world_to_camera": np.eye(4).tolist(), "lens": lens}
         content = {"reprojection_error_px": 0.5, "lost": [], "unsure": {}, "pictures": [picture]}
@@ -294,10 +294,10 @@ def _json(add) -> None:
         poses.load_poses(path.with_name("poses.json"), path.with_name("points.ply"))
 
     def lenses(folder: Path) -> Path:
-        return found_poses(folder).with_name("lenses.json")
+        return saved_poses(folder).with_name("lenses.json")
 
     def points(folder: Path) -> Path:
-        return found_poses(folder).with_name("points.ply")
+        return saved_poses(folder).with_name("points.ply")
 
     def calibration(folder: Path) -> Path:
         write_json(folder / "cameras_calib.json", {"a": {"rvecs": [0.1, 0, 0], "tvecs": [[0], [0], [1]]}})
@@ -310,7 +310,7 @@ def _json(add) -> None:
         return place / "0.json"
 
     add("identified.json", identified, read_identified, is_text=True)
-    add("poses.json", found_poses, read_poses, is_text=True)
+    add("poses.json", saved_poses, read_poses, is_text=True)
     add("points.ply", points, read_poses)
     add("lenses.json", lenses, poses.read_lenses, is_text=True)
     add("cameras_calib.json", calibration, released._poses, is_text=True)
