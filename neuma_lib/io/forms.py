@@ -73,7 +73,9 @@ def _wrong(value: Any, form: Any, key: str) -> tuple[str, str] | None:
     """The key of the first part that has another form, and the expected one."""
     if isinstance(form, tuple):
         results = [_wrong(value, each, key) for each in form]
-        return None if None in results else (key, " or ".join(expected for _, expected in results if expected))
+        return (
+            None if None in results else (key, " or ".join(expected for _, expected in results if expected))
+        )
     if isinstance(form, dict):
         if not isinstance(value, dict):
             return key, "an object"

@@ -95,7 +95,7 @@ def _check_pickle(content: bytes, sizes: Mapping[str, int]) -> None:
     """
     limit = 1000 + 10 * len(content)
     stack: list[Any] = []  # number of objects in each object, and its value if it is a text, number or tuple
-    memo: dict[int, Any] = {}
+    memo: dict[Any, Any] = {}
     for opcode, argument, _ in pickletools.genops(content):
         name = opcode.name
         if name not in _OPCODES or (name == "GLOBAL" and argument not in _GLOBALS | _STORAGES.keys()):
