@@ -103,9 +103,16 @@ def parse_json(content: str | bytes, where: str | Path) -> Any:
             content,
             parse_constant=_finite,
             parse_float=_finite,
-            parse_int=lambda text: int(text) if len(text) < 300 else _finite("1e999"),
+            parse_int=_int64,
             object_pairs_hook=lambda pairs: JsonObject.of(pairs, str(where)),
         )
+
+
+def _int64(text: str) -> int:
+    """An integer that numpy can hold."""
+    if len(text) > 20 or not -(2**63) <= int(text) < 2**63:
+        raise ValueError(f"{one_line(text, 30)} is too large an integer")
+    return int(text)
 
 
 def _finite(text: str) -> float:
