@@ -274,6 +274,7 @@ def with_top(**changes):
 
 LISTS = {
     **{f"file_path {value!r}": with_frame(file_path=value) for value in (5, None, ["a.png"], {}, "", "a\nb", "\0")},
+    "a long file_path": with_frame(file_path="a" * 300),
     **{f"view {value!r}": with_frame(view=value) for value in ("5", None, 5.5, [5], True, {})},
     **{f"step {value!r}": with_frame(step=value) for value in ("5", None, 5.5, [5])},
     **{f"frames {value!r}": with_top(frames=value) for value in (5, "text", None, [5], [None], ["a"], {}, [[]])},
