@@ -268,7 +268,7 @@ def _of_method(options: argparse.Namespace) -> tuple[Law, dict[str, Any]]:
     from neuma_lib.project import cases
     from neuma_lib.project.project import Project
 
-    if options.adaptor or options.dt:
+    if options.adaptor or options.dt is not None:
         raise InputError(
             options.source,
             "it is a method's folder, whose adaptor and time step are known",
@@ -290,7 +290,7 @@ def _of_method(options: argparse.Namespace) -> tuple[Law, dict[str, Any]]:
 
 def _of_file(options: argparse.Namespace) -> tuple[Law, dict[str, Any]]:
     """The same of a file, with what an exported one already states."""
-    from neuma_lib.io.exported import EXPORT, checked_export
+    from neuma_lib.io.exported import EXPORT, check_step, checked_export
     from neuma_lib.io.files import existing
     from neuma_lib.io.laws import RELEASED_ALPHA, load_law
     from neuma_lib.io.weights import read_weights
@@ -300,9 +300,8 @@ def _of_file(options: argparse.Namespace) -> tuple[Law, dict[str, Any]]:
     if source.suffix == ".safetensors":
         _, metadata = read_weights(source)
         stated = checked_export(metadata) if EXPORT in metadata else {}
-    if options.dt is not None and options.dt <= 0:
-        raise InputError("--dt", f"{options.dt:g} must be a positive time step in seconds")
-    dt = options.dt or stated.get("dt")
+    check_step("--dt", options.dt)
+    dt = stated.get("dt") if options.dt is None else options.dt
     alpha = RELEASED_ALPHA if options.alpha is None else options.alpha
     law = load_law(source, options.adaptor, dt, options.any_time_step, alpha)
     of_the_law = ("grid", "gravity", "density", "scale")

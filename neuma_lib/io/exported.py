@@ -45,7 +45,15 @@ SAME_STEP = 1e-6
 
 
 def about_law(law: Law, dt: float | None, any_time_step: bool = False, **known: Any) -> dict[str, Any]:
-    """Metadata of a law; keys of the module that are neither given nor derived from the law are null."""
+    """Metadata of a law; keys of the module that are neither given nor derived from the law are null.
+
+    Raises:
+        InputError: a number that is not finite, or a time step that is not positive.
+    """
+    check_step("dt", dt)
+    for key, value in known.items():
+        if isinstance(value, float) and not math.isfinite(value):
+            raise InputError(key, f"{value} must be a finite number")
     conditions = ("grid", "gravity", "density", "scale")
     origin = ("scene", "method", "prior", "commit", "metrics", "visited")
     kind = "networks" if isinstance(law, AdaptableLaw) else "analytic"
@@ -83,10 +91,14 @@ def checked_export(metadata: Mapping[str, Any]) -> dict[str, Any]:
             f"this code reads up to version {SCHEMA}, not {one_line(schema)}",
             "Update the code, or export the law again",
         )
-    dt = about.get("dt")
-    if dt is not None and not (type(dt) in (int, float) and math.isfinite(dt) and dt > 0):
-        raise InputError(f"{EXPORT}.dt", f"must be a positive number of seconds, not {one_line(dt)}")
+    check_step(f"{EXPORT}.dt", about.get("dt"))
     return about
+
+
+def check_step(where: str, dt: Any) -> None:
+    """Raise an `InputError` for a time step that is neither null nor a positive, finite number."""
+    if dt is not None and not (type(dt) in (int, float) and 0 < dt < math.inf):
+        raise InputError(where, f"{one_line(dt)} must be a positive number of seconds")
 
 
 def fitting_step(about: Mapping[str, Any], dt: float | None, any_time_step: bool = False) -> float | None:
@@ -96,6 +108,7 @@ def fitting_step(about: Mapping[str, Any], dt: float | None, any_time_step: bool
         InputError: the law is fixed to the step of its training, ``dt`` differs, and neither the caller nor the file
             allows other steps.
     """
+    check_step("dt", dt)
     own = about.get("dt")
     if dt is None or own is None:
         return own if dt is None else dt

@@ -12,15 +12,17 @@ from __future__ import annotations
 import errno
 import hashlib
 import json
+import math
 import os
 import re
 import zipfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from neuma_lib.errors import InputError
+from neuma_lib.io.forms import JsonObject, check_form
 
 
 @contextmanager
@@ -81,18 +83,43 @@ def write_json(path: str | Path, data: Any) -> None:
 
 
 def read_json(path: str | Path) -> Any:
-    """Read JSON. Raises InputError if the file is missing or is not JSON (NaN and Infinity are not)."""
-    return parse_json(existing(path).read_bytes(), path)
+    """Read JSON. Raises InputError if the file is missing, is not JSON, or has entries of other types than its form.
+
+    A missing entry raises InputError where it is used.
+    """
+    content = parse_json(existing(path).read_bytes(), path)
+    check_form(path, content)
+    return content
 
 
 def parse_json(content: str | bytes, where: str | Path) -> Any:
-    """Value of a JSON text. Raises InputError, which names ``where``, if it is not JSON or nested too deeply."""
+    """Value of a JSON text, with objects as `JsonObject`.
+
+    Raises:
+        InputError: names ``where``. Not JSON, nested too deeply, a repeated key, or a number that is not finite.
+    """
     with reading(where, "JSON"):
-        return json.loads(content, parse_constant=_refuse_constant)
+        return json.loads(
+            content,
+            parse_constant=_finite,
+            parse_float=_finite,
+            parse_int=_int64,
+            object_pairs_hook=lambda pairs: JsonObject.of(pairs, str(where)),
+        )
 
 
-def _refuse_constant(name: str) -> NoReturn:
-    raise ValueError(f"{name} is not valid JSON")
+def _int64(text: str) -> int:
+    """An integer that numpy can hold."""
+    if len(text) > 20 or not -(2**63) <= int(text) < 2**63:
+        raise ValueError(f"{one_line(text, 30)} is too large an integer")
+    return int(text)
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text} is not valid JSON")
+    return value
 
 
 @contextmanager

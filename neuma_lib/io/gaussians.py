@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 
@@ -42,7 +43,7 @@ def load_gaussians(path: str | Path, remedy: str = "Fit the Gaussians again") ->
     """Read Gaussians in the 3DGS layout, in float32, with unit quaternions.
 
     Raises:
-        InputError: missing properties, or values that are not finite, with the given ``remedy``.
+        InputError: missing properties, or see `checked_gaussians`.
     """
     rows, _ = read_ply(path)
     names = set(rows.dtype.names)
@@ -65,19 +66,44 @@ def load_gaussians(path: str | Path, remedy: str = "Fit the Gaussians again") ->
         raw[key] = np.zeros((len(rows), len(columns)), np.float32)
         for i, column in enumerate(columns):
             raw[key][:, i] = rows[column]
-        # converters from layouts with 8-bit opacities write 0 and 1 as infinite logits
-        usable = ~np.isnan(raw[key]) if key == "opacities" else np.isfinite(raw[key])
-        if (bad := ~usable.all(axis=1)).any():
-            raise InputError(path, f"{key} of Gaussian {np.argmax(bad)} is not finite", remedy)
-    norm = np.linalg.norm(raw["quats"], axis=1, keepdims=True)
-    if (norm == 0).any():
-        raise InputError(path, f"the rotation of Gaussian {np.argmin(norm)} is zero", remedy)
-    arrays = {
-        "means": raw["means"],
-        "quats": raw["quats"] / norm,
-        "scales": np.exp(raw["scales"]),
-        "opacities": (1 / (1 + np.exp(-raw["opacities"][:, 0].astype(np.float64)))).astype(np.float32),
-        "sh0": raw["sh0"][:, None, :],
-        "shN": np.ascontiguousarray(np.swapaxes(raw["shN"].reshape(len(rows), 3, rest // 3), 1, 2)),
+    with np.errstate(
+        over="ignore"
+    ):  # layouts with 8-bit opacities are converted to infinite logits of 0 and 1
+        arrays = {
+            "means": raw["means"],
+            "quats": raw["quats"],
+            "scales": np.exp(raw["scales"]),
+            "opacities": 1 / (1 + np.exp(-raw["opacities"][:, 0].astype(np.float64))),
+            "sh0": raw["sh0"][:, None, :],
+            "shN": np.swapaxes(raw["shN"].reshape(len(rows), 3, rest // 3), 1, 2),
+        }
+    return checked_gaussians(arrays, path, remedy)
+
+
+def checked_gaussians(arrays: Mapping[str, np.ndarray], path: str | Path, remedy: str) -> Gaussians:
+    """Gaussians in float32 from arrays by name, with normalised quaternions.
+
+    Raises:
+        InputError: no Gaussians; or names one with values that are not finite, a scale that is not positive, or a
+            rotation of zero.
+    """
+    if len(arrays["means"]) == 0:
+        raise InputError(path, "has no Gaussians")
+    norm = np.linalg.norm(arrays["quats"], axis=1, keepdims=True)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        single = {**arrays, "quats": arrays["quats"] / norm}
+        single = {name: np.ascontiguousarray(array, np.float32) for name, array in single.items()}
+    bad = {
+        "the rotation of Gaussian {} is zero": norm[:, 0] == 0,
+        **{
+            f"{name} of Gaussian {{}} is not finite": ~np.isfinite(array).all(
+                axis=tuple(range(1, array.ndim))
+            )
+            for name, array in single.items()
+        },
+        "a scale of Gaussian {} is not positive": (single["scales"] <= 0).any(axis=1),
     }
-    return Gaussians(**{name: torch.from_numpy(array) for name, array in arrays.items()})
+    for problem, rows in bad.items():
+        if rows.any():
+            raise InputError(path, problem.format(np.argmax(rows)), remedy)
+    return Gaussians(**{name: torch.from_numpy(array) for name, array in single.items()})

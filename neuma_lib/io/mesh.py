@@ -8,6 +8,8 @@ import numpy as np
 import trimesh
 
 from neuma_lib.errors import InputError
+from neuma_lib.io.files import reading
+from neuma_lib.io.hdf5 import check_indices
 from neuma_lib.io.ply import read_ply, write_ply
 
 
@@ -32,8 +34,8 @@ def read_mesh(path: str | Path, watertight: bool = True) -> trimesh.Trimesh:
     vertices = np.stack([rows[axis] for axis in "xyz"], axis=1).astype(np.float64)
     if (bad := ~np.isfinite(vertices).all(axis=1)).any():
         raise InputError(path, f"vertex {np.argmax(bad)} of {len(bad)} is not finite", "Rebuild the mesh")
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise InputError(path, "a face refers to a vertex that does not exist", "Rebuild the mesh")
+    with reading(path, "a triangle mesh"):
+        check_indices("faces", faces, len(vertices))
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     if watertight and not mesh.is_watertight:
         raise InputError(path, "is not watertight", "Close its holes with a mesh repair tool")

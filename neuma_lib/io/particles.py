@@ -6,14 +6,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
 
 from neuma_lib.coupling.binding import Binding
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError
-from neuma_lib.io.files import read_json
+from neuma_lib.io.files import read_json, reading
 from neuma_lib.io.gaussians import load_gaussians
-from neuma_lib.io.hdf5 import read_arrays, write_arrays
+from neuma_lib.io.hdf5 import check_indices, read_arrays, write_arrays
 from neuma_lib.mechanics.density import Density, density_at
 from neuma_lib.sim.state import State
 
@@ -60,6 +61,8 @@ def load_reconstruction(
     """
     splats = load_gaussians(gaussians)
     x0, vol0, _ = load_particles(particles)
+    if len(x0) == 0 or vol0.min() <= 0:
+        raise InputError(particles, "has no particles, or a volume that is not positive", "Regenerate it")
     arrays, attributes = read_arrays(binding, required=("indptr", "indices", "values"))
     for kind, file, count in (("gaussians", gaussians, len(splats)), ("particles", particles, len(x0))):
         if attributes.get(kind) != count:
@@ -67,6 +70,8 @@ def load_reconstruction(
             raise InputError(binding, problem, "Run the rule binding again")
     if particle_source == "gaussians":
         return Reconstruction.of_gaussians(splats, float(vol0.sum()), density)
+    with reading(binding, "a binding"):
+        _check_rows(arrays["indptr"], arrays["indices"], (len(splats), len(x0)))
     return Reconstruction(
         x0=x0,
         vol0=vol0,
@@ -77,6 +82,18 @@ def load_reconstruction(
         ),
         affine=gaussian_motion == "affine",
     )
+
+
+def _check_rows(indptr: np.ndarray, indices: np.ndarray, shape: tuple[int, int]) -> None:
+    """Check a sparse matrix of ``shape`` in CSR format. Raises ValueError."""
+    check_indices("indices", indices, shape[1])
+    if (
+        len(indptr) != shape[0] + 1
+        or indptr[0] != 0
+        or indptr[-1] != len(indices)
+        or (np.diff(indptr) < 0).any()
+    ):
+        raise ValueError(f"indptr must ascend from 0 to {len(indices)} in {shape[0]} rows")
 
 
 INITIAL_MOTION = ("v0", "angular_velocity", "centre")
@@ -114,14 +131,14 @@ def load_initial_state(
     together = load_reconstruction(particles, binding, gaussians, 1.0, particle_source)
     x0, vol0 = together.x0, together.vol0
     motion = _initial_motion(velocity)
-    parts = motion.get("bodies", [{**motion, "particles": len(x0)}])
+    parts = motion.get("bodies") or [motion]
     if particle_source == "gaussians":
         if len(parts) > 1:
             problem = f"has {len(parts)} bodies, but the Gaussians can be the particles of one body only"
             raise InputError(velocity, problem, "Choose a method that is evaluated on particles")
-        parts = [{**parts[0], "particles": len(x0)}]
-    counts = [part["particles"] for part in parts]
-    if sum(counts) != len(x0) or len(densities) != len(counts):
+    stated = particle_source != "gaussians" and "bodies" in motion
+    counts = [part["particles"] for part in parts] if stated else [len(x0)]
+    if sum(counts) != len(x0) or min(counts) < 1 or len(densities) != len(counts):
         raise InputError(velocity, f"does not have the bodies of {particles}", "Regenerate both")
     return State.joined([
         State.rigid(x, vol * density_at(x, density), vol, *(part[key] for key in INITIAL_MOTION))

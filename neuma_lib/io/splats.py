@@ -16,12 +16,11 @@ from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from neuma_lib.errors import InputError
 from neuma_lib.io.compressed_splats import is_compressed, unpacked
 from neuma_lib.io.files import existing, reading
-from neuma_lib.io.gaussians import load_gaussians
+from neuma_lib.io.gaussians import checked_gaussians, load_gaussians
 from neuma_lib.io.ply import read_elements
 from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.splatting.spherical_harmonics import MAX_DEGREE, SH_C0, coefficient_count
@@ -38,8 +37,10 @@ _SPZ_EXTENSIONS = 2
 """Flag of extensions, which include other ranges of the harmonics."""
 _SPZ_COLOUR = 0.15
 """Stored colour per unit of sh0."""
-_MAX_INFLATION = 1040
-"""Maximum compression ratio of gzip (DEFLATE: 1032), with a margin for short files."""
+_MAX_INFLATION = 16
+"""Maximum compression ratio; that of scans is 1 to 5, and that of gzip itself up to 1032."""
+_ALWAYS_READ = 2**23
+"""Unpacked size that is read at any ratio [bytes]."""
 
 
 def load_splat(path: str | Path) -> Gaussians:
@@ -58,26 +59,11 @@ def load_splat(path: str | Path) -> Gaussians:
             if not is_compressed(elements):
                 loaded = load_gaussians(path, _REMEDY)
                 arrays = {field.name: getattr(loaded, field.name).numpy() for field in fields(loaded)}
-                return _checked(arrays, path)
-            return _checked(unpacked(elements), path)
+                return checked_gaussians(arrays, path, _REMEDY)
+            return checked_gaussians(unpacked(elements), path, _REMEDY)
     with reading(path, f"a {kind} file"):
-        return _checked((_read_splat if kind == ".splat" else _read_spz)(path), path)
-
-
-def _checked(arrays: dict[str, np.ndarray], path: Path) -> Gaussians:
-    """Gaussians from arrays by name, with normalised quaternions."""
-    if len(arrays["means"]) == 0:
-        raise InputError(path, "has no Gaussians")
-    for name, array in arrays.items():
-        if (bad := ~np.isfinite(array.reshape(len(array), -1)).all(axis=1)).any():
-            raise InputError(path, f"{name} of Gaussian {np.argmax(bad)} is not finite", _REMEDY)
-    norm = np.linalg.norm(arrays["quats"], axis=1, keepdims=True)
-    if (norm == 0).any():
-        raise InputError(path, f"the rotation of Gaussian {np.argmin(norm)} is zero", _REMEDY)
-    arrays = {**arrays, "quats": arrays["quats"] / norm}
-    return Gaussians(**{
-        name: torch.from_numpy(np.ascontiguousarray(array, np.float32)) for name, array in arrays.items()
-    })  # fmt: skip
+        arrays = (_read_splat if kind == ".splat" else _read_spz)(path)
+        return checked_gaussians(arrays, path, _REMEDY)
 
 
 def _read_splat(path: Path) -> dict[str, np.ndarray]:
@@ -114,8 +100,10 @@ def _read_spz(path: Path) -> dict[str, np.ndarray]:
         "quats": 4 if version == 3 else 3, "shN": 3 * rest,
     }  # fmt: skip
     size = count * sum(widths.values())
-    if size > _MAX_INFLATION * len(packed):
-        raise ValueError(f"the header claims {count} Gaussians, more than the file can contain")
+    if size > max(_MAX_INFLATION * len(packed), _ALWAYS_READ):
+        raise ValueError(
+            f"its header claims {size} bytes ({count} Gaussians), too many for {len(packed)} packed ones"
+        )
     body = stream.decompress(stream.unconsumed_tail, size) if size else b""
     if len(body) < size:
         raise ValueError(f"it ends after {len(body)} of {size} bytes")

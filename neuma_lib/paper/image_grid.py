@@ -15,6 +15,7 @@ from matplotlib.textpath import TextPath
 
 from neuma_lib.errors import InputError
 from neuma_lib.evaluation.plotting import style
+from neuma_lib.io.files import parse_json
 from neuma_lib.io.hdf5 import read_arrays, write_arrays
 
 GAP = 0.02
@@ -67,7 +68,7 @@ def load_image_grid(path: str | Path) -> ImageGrid:
         raise InputError(
             path, f"not the data of a figure, it has no {', '.join(missing)}", "Build the figure again"
         )
-    rows, columns, numbers = (json.loads(attributes[name]) for name in ("rows", "columns", "numbers"))
+    rows, columns, numbers = (parse_json(attributes[name], path) for name in ("rows", "columns", "numbers"))
     return ImageGrid(arrays["images"], tuple(rows), tuple(columns), numbers)
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from neuma_lib.errors import InputError
 from neuma_lib.evaluation.text_tables import as_markdown
+from neuma_lib.io.files import reading
 
 COLUMNS = {
     "runs": "runs",
@@ -62,9 +63,11 @@ def _aggregate(runs: Sequence[Mapping[str, float]]) -> dict[str, float]:
 
 def _measured(benchmark: Path, log: Path) -> dict[str, float]:
     """The columns of one run."""
-    header, values = (line.split("\t") for line in benchmark.read_text().splitlines()[:2])
-    measured = dict(zip(header, values, strict=True))
-    seconds, memory = float(measured["s"]), measured["max_rss"]
+    with reading(benchmark, "a benchmark of Snakemake"):
+        header, values = (line.split("\t") for line in benchmark.read_text().splitlines()[:2])
+        measured = dict(zip(header, values, strict=True))
+        seconds, memory = float(measured["s"]), measured["max_rss"]
+        memory = 0.0 if memory in ("-", "NA") else float(memory)
     start, work = core_seconds(log) or (0.0, 0.0)
     return {
         "runs": 1,
@@ -72,5 +75,5 @@ def _measured(benchmark: Path, log: Path) -> dict[str, float]:
         "longest": seconds,
         "core_seconds": start + work,
         "start": start,
-        "memory": 0.0 if memory in ("-", "NA") else float(memory),
+        "memory": memory,
     }

@@ -2,6 +2,8 @@
 
 import importlib.util
 import json
+import os
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,7 @@ from PIL import Image, ImageDraw
 from pydantic import ValidationError
 
 from neuma_lib.config.blender import AppearanceConfig
+from neuma_lib.data.blender import worker
 from neuma_lib.data.blender.appearance import colors_at, smooth_noise
 from neuma_lib.data.blender.bodies import make_body
 from neuma_lib.data.blender.libraries import explain_import_error
@@ -307,3 +310,20 @@ def test_colours_on_the_image_are_those_of_the_surface(tmp_path):
     pictures = read_image_set(tmp_path / "transforms.json").images / 255.0
     inside = pictures[pictures[..., 3] == 1.0]
     assert np.abs(inside[:, :3] - 0.6).max() < 0.12
+
+
+def test_locks_are_in_a_folder_of_the_user(tmp_path, monkeypatch):
+    """A link with the name of a lock is not followed, and the temporary folder is not used."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
+    monkeypatch.setattr(os, "sched_setaffinity", lambda pid, cores: None)
+    for lock in worker.claim_cores(1):
+        lock.close()
+    (made,) = (tmp_path / "cache").rglob("*.lock")
+    folder = made.parent
+    assert folder.stat().st_mode & 0o777 == 0o700 and made.stat().st_mode & 0o777 == 0o600
+    made.unlink()
+    made.symlink_to(tmp_path / "target")
+    with pytest.raises(OSError):
+        worker.own_lock(made.stem)
+    assert not (tmp_path / "target").exists()

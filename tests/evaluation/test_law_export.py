@@ -330,6 +330,9 @@ def test_a_failed_export_writes_nothing(tmp_path, capsys):
         ([law, "new.safetensors", "--weight", "0.5", "--separate"], "--separate"),
         ([law, "new.safetensors", "--dt", "1e-3"], "trained at a time step"),
         ([law, "new.safetensors", "--dt=-1"], "--dt: -1"),
+        ([law, "new.safetensors", "--dt=0"], "--dt: 0"),
+        ([law, "new.safetensors", "--dt=nan"], "--dt: nan"),
+        ([law, "new.safetensors", "--dt=inf"], "--dt: inf"),
         (["missing.pt", "new.safetensors"], "does not exist"),
         ([tmp_path / "folder", "new.safetensors"], "config/config.yaml"),
     ):

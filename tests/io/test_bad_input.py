@@ -9,6 +9,7 @@ import zipfile
 import zlib
 from collections import OrderedDict
 from io import BytesIO
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -21,12 +22,15 @@ from neuma_lib.capture.masks.regions import read_mask
 from neuma_lib.capture.pictures import read_picture
 from neuma_lib.errors import InputError
 from neuma_lib.io.checkpoint import Checkpoint
-from neuma_lib.io.gaussians import load_gaussians
-from neuma_lib.io.hdf5 import read_arrays
+from neuma_lib.io.files import read_json
+from neuma_lib.io.gaussians import load_gaussians, save_gaussians
+from neuma_lib.io.hdf5 import read_arrays, write_arrays
 from neuma_lib.io.images import list_images, read_image_set
 from neuma_lib.io.laws import load_law, load_prior
 from neuma_lib.io.mesh import read_mesh
-from neuma_lib.io.weights import read_weights
+from neuma_lib.io.particles import load_reconstruction, save_particles, with_motion
+from neuma_lib.io.weights import read_torch, read_weights
+from tests.support.splat_files import ball
 
 pytestmark = pytest.mark.core
 
@@ -140,7 +144,25 @@ def attribute(value):
     return change
 
 
+def twice_packed(file, folder):
+    """64 MiB of zeros in a few bytes, in a chunk of 8 bytes."""
+    packed = zlib.compress(zlib.compress(bytes(HUGE), 9), 9)
+    create = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    create.set_chunk((2, 3))
+    for _ in range(2):
+        create.set_deflate(9)
+    space = h5py.h5s.create_simple((2, 3))
+    data = h5py.h5d.create(file.id, b"x", h5py.h5t.NATIVE_DOUBLE, space, create)
+    data.write_direct_chunk((0, 0), packed)
+
+
 HDF5 = {
+    "two gzip filters": twice_packed,
+    "a filter": lambda file, folder: file.create_dataset("x", data=np.ones((2, 3)), shuffle=True),
+    "another shape": lambda file, folder: file.update(x=np.zeros((2, 4))),
+    "shapes that do not match": lambda file, folder: file.update(x=np.zeros((2, 3)), vol0=np.ones(3)),
+    "frames that are not integers": lambda file, folder: file.update(x=np.zeros((2, 3)), frames=np.zeros(1)),
+    "negative frames": lambda file, folder: file.update(x=np.zeros((2, 3)), frames=np.array([-1])),
     "external link": external_link,
     "soft link": soft_link,
     "dangling link": lambda file, folder: file.update(x=h5py.SoftLink("/absent")),
@@ -180,6 +202,47 @@ def test_other_datasets_are_not_read(tmp_path):
     assert set(read_arrays(path, only=("vol0",))[0]) == {"vol0"}
 
 
+def test_a_heap_of_texts_without_end(tmp_path):
+    """HDF5 does not return from a free space of size 0."""
+    path = tmp_path / "bad.h5"
+    write_arrays(path, {"x": np.zeros((2, 3))}, {"title": "text"})
+    content = bytearray(path.read_bytes())
+    at = content.index(b"GCOL") + 16
+    while index := struct.unpack_from("<H", content, at)[0]:
+        assert index < 10
+        at += 16 + 8 * -(-struct.unpack_from("<Q", content, at + 8)[0] // 8)
+    content[at + 8 : at + 16] = bytes(8)
+    path.write_bytes(content)
+    refused(read_arrays, path, "damaged")
+
+
+def test_binding(tmp_path):
+    """Rows and indices that would make a kernel read foreign memory."""
+    valid = {"indptr": np.array([0, 2, 3]), "indices": np.array([0, 3, 2]), "values": np.ones(3)}
+    save_gaussians(tmp_path / "gaussians.ply", ball(2))
+    save_particles(tmp_path / "particles.h5", torch.rand(4, 3), torch.ones(4), {})
+    path = tmp_path / "binding.h5"
+
+    def read(path):
+        return load_reconstruction(path.with_name("particles.h5"), path, path.with_name("gaussians.ply"), 1.0)
+
+    write_arrays(path, valid, {"gaussians": 2, "particles": 4})
+    assert read(path).binding.indices.tolist() == [0, 3, 2]
+    for change in (
+        {"indices": np.array([0, 4, 2])},
+        {"indices": np.array([0, -1, 2])},
+        {"indices": np.array([0.0, 1.0, 2.0])},
+        {"indices": np.array([0, 1])},
+        {"indptr": np.array([0, 2, 2**40])},
+        {"indptr": np.array([0, 4, 3])},
+        {"indptr": np.array([1, 2, 3])},
+        {"indptr": np.array([0, 3])},
+        {"values": np.ones(2)},
+    ):
+        write_arrays(path, valid | change, {"gaussians": 2, "particles": 4})
+        refused(read, path)
+
+
 @pytest.mark.parametrize("content", [b"", b"\x89HDF\r\n\x1a\n", b"\x89HDF\r\n\x1a\n" + bytes(300)])
 def test_other_files_than_hdf5(tmp_path, content):
     path = tmp_path / "bad.h5"
@@ -214,6 +277,7 @@ def with_top(**changes):
 
 LISTS = {
     **{f"file_path {value!r}": with_frame(file_path=value) for value in (5, None, ["a.png"], {}, "", "a\nb", "\0")},
+    "a long file_path": with_frame(file_path="a" * 300),
     **{f"view {value!r}": with_frame(view=value) for value in ("5", None, 5.5, [5], True, {})},
     **{f"step {value!r}": with_frame(step=value) for value in ("5", None, 5.5, [5])},
     **{f"frames {value!r}": with_top(frames=value) for value in (5, "text", None, [5], [None], ["a"], {}, [[]])},
@@ -245,6 +309,35 @@ def test_lists_of_images(tmp_path, content):
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
     refused(read_image_set, path)
     refused(lambda p: list_images(p, p.parent / "new" / "transforms.json"), path)
+
+
+MOTION = {"v0": [0, -1, 0], "angular_velocity": [0, 0, 0], "centre": [0.5, 0.5, 0.5]}
+
+
+@pytest.mark.parametrize(
+    ("text", "key"),
+    [
+        ({"v0": MOTION["v0"]}, "angular_velocity"),
+        ({**MOTION, "v0": "fast"}, "v0: must be a list of 3"),
+        ({**MOTION, "v0": [0, "1", 0]}, r"v0\[1\]: must be a number"),
+        ({**MOTION, "v0": [0, True, 0]}, r"v0\[1\]: must be a number"),
+        ({**MOTION, "centre": [1, 2]}, "centre: must be a list of 3 or null"),
+        ([MOTION], "must be an object"),
+        ('{"v0": [0, 0, 0], "v0": [1, 1, 1]}', "v0.*twice"),
+        ('{"v0": [0, 0, 1e999]}', "1e999"),
+    ],
+)
+def test_json_of_stages(tmp_path, text, key):
+    path = tmp_path / "velocity.json"
+    path.write_text(text if isinstance(text, str) else json.dumps(text))
+    refused(lambda p: with_motion(SimpleNamespace(state=lambda *_: None), p), path, key)
+
+
+def test_missing_entries_are_named_in_any_file(tmp_path):
+    path = tmp_path / "any.json"
+    path.write_text('{"a": {"b": [{"c": 1}]}}')
+    assert read_json(path) == {"a": {"b": [{"c": 1}]}}
+    refused(lambda p: read_json(p)["a"]["b"][0]["d"], path, "'d'")
 
 
 def chunk(kind, data):
@@ -320,6 +413,32 @@ def deflated(content, part="/data/"):
     return file.getvalue()
 
 
+def pickled(opcodes):
+    """The same archive with another pickle."""
+    file = BytesIO()
+    with (
+        zipfile.ZipFile(BytesIO(torch_file({"a": torch.zeros(2)}))) as old,
+        zipfile.ZipFile(file, "w") as new,
+    ):
+        for info in old.infolist():
+            new.writestr(info.filename, opcodes if info.filename.endswith(".pkl") else old.read(info))
+    return file.getvalue()
+
+
+NESTED_TUPLES = b")" + b"".join(b"q" + bytes([k]) + b"h" + bytes([k]) + b"\x86" for k in range(60))
+"""A tuple of two tuples, which are the same, and so on: 2^60 in 300 bytes."""
+ENCODED = (
+    b"\x80\x02"
+    + 28 * b"c_codecs\nencode\n"
+    + b"X\1\0\0\0aX\5\0\0\0ascii\x86R"
+    + 27 * b"X\3\0\0\0hex\x86R"
+    + b"."
+)
+"""Hexadecimal digits of digits: 2^27 bytes from one."""
+LONGER = torch_file({"a": torch.zeros(2)}).replace(b"K\x02tq", b"K\x63tq")
+"""A tensor of 99 numbers that stores 2."""
+
+
 def law_parts(weight):
     names = ("layers.0.fc.weight", "layers.1.fc.weight", "final_layer.fc.weight")
     return {part: dict.fromkeys(names, weight) for part in ("elasticity", "plasticity")}
@@ -341,6 +460,9 @@ TORCH = {
     "64 MiB deflated": deflated(law_parts(torch.zeros(2))),
     "64 MiB deflated, which its header denies": denied(deflated(law_parts(torch.zeros(2)), "data.pkl")),
     "an ordered list": torch_file(OrderedDict(a=1)),
+    "an encoder": pickled(ENCODED),
+    "a key of nested tuples": pickled(b"\x80\x02}" + NESTED_TUPLES + b"K\1s."),
+    "a tensor that is longer than its storage": LONGER,
 }
 
 
@@ -349,6 +471,8 @@ def test_torch_files(tmp_path, content, capsys):
     path = tmp_path / "bad.pt"
     path.write_bytes(content)
     refused(load_prior, path)
+    if content is LONGER:
+        refused(read_torch, path)
     refused(lambda p: Checkpoint(p, {"a": 1}).load(), path, "rm ")
     assert "unpickled" not in capsys.readouterr().out
 

@@ -21,6 +21,7 @@ from neuma_lib.geometry.splat_surface import opacity_and_depth, splat_surface, v
 from neuma_lib.geometry.volume import inside
 from neuma_lib.io.compressed_splats import save_compressed
 from neuma_lib.io.gaussians import save_gaussians
+from neuma_lib.io.ply import read_ply, write_ply
 from neuma_lib.io.splats import load_splat
 from neuma_lib.project import cases
 from neuma_lib.project.find import scene_files
@@ -135,6 +136,19 @@ def written(writer, change=lambda data: data, gaussians=None, **options):
 
 
 WITH_NAN = dataclasses.replace(ball(40), means=ball(40).means.index_fill(0, torch.tensor([7]), math.nan))
+
+
+def with_log_scale(path, value):
+    """A Gaussian whose scale is 0 or infinite in single precision."""
+    save_gaussians(path, ball(40))
+    rows, _ = read_ply(path)
+    rows["scale_0"][7] = value
+    write_ply(path, rows)
+
+
+FLAT = dataclasses.replace(ball(40), scales=ball(40).scales.index_fill(0, torch.tensor([7]), 0.0))
+ZEROS = gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, 3, 2**20, 0, 12, 0, 0) + bytes(20 * 2**20), mtime=0)
+"""A million Gaussians in 20 kB."""
 POINTS = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n"
 
 
@@ -144,6 +158,10 @@ POINTS = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header
         ("a.obj", b"v 0 0 0\n", "must end in"),
         ("a.splat", written(write_splat, cut), "multiple of 32"),
         ("a.splat", written(write_splat, gaussians=WITH_NAN), "Gaussian 7 is not finite"),
+        ("a.splat", written(write_splat, gaussians=FLAT), "scale of Gaussian 7 is not positive"),
+        ("a.ply", lambda path: with_log_scale(path, -200), "scale of Gaussian 7 is not positive"),
+        ("a.ply", lambda path: with_log_scale(path, 200), "scales of Gaussian 7 is not finite"),
+        ("a.spz", written(lambda path, g: path.write_bytes(ZEROS)), "too many for"),
         ("a.splat", b"", "no Gaussians"),
         ("a.spz", written(write_spz, lambda data: data[:-40]), "ends after"),
         ("a.spz", written(write_spz, count=2**31), "claims"),

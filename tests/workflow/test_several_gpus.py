@@ -22,7 +22,7 @@ def start(tmp_path):
         script.parent.mkdir(parents=True, exist_ok=True)
         script.write_text(SCRIPT)
         known = {name: value for name, value in os.environ.items() if name != "CUDA_VISIBLE_DEVICES"}
-        known |= {"PYTHONPATH": str(GPUS), "TMPDIR": str(tmp_path), "NEUMA_GPUS": "2", **variables}
+        known |= {"PYTHONPATH": str(GPUS), "XDG_CACHE_HOME": str(tmp_path), "NEUMA_GPUS": "2", **variables}
         process = subprocess.Popen(
             [sys.executable, script], env=known, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         )

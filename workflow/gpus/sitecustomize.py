@@ -7,19 +7,21 @@ frees when a process ends, however it ends.
 
 import fcntl
 import os
+import platform
 import sys
-import tempfile
 from itertools import count
 from pathlib import Path
 
 
 def claim_gpu(gpus: int) -> tuple[int, object]:
     """The GPU with the lowest free place, and the open file that holds it: keep it for as long as it counts."""
-    folder = Path(tempfile.gettempdir()) / f"neuma-gpus-{os.getuid()}"
-    folder.mkdir(exist_ok=True)
+    # in the common temporary folder a name could be a link that another user made
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "neuma_lib" / platform.node()
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     for place in count():
         for gpu in range(gpus):
-            file = open(folder / f"{gpu}-{place}.lock", "w")
+            flags = os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW
+            file = open(os.open(folder / f"gpu-{gpu}-{place}.lock", flags, 0o600), "w")
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 return gpu, file

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import fcntl
 import os
+import platform
 import sys
-import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +22,16 @@ def quiet_stdout():
     return real
 
 
+def own_lock(name: str) -> int:
+    """File descriptor of a lock file of this user on this computer, in a folder that other users cannot enter.
+
+    A name in the common temporary folder could be a link that another user made.
+    """
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "neuma_lib" / platform.node()
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    return os.open(folder / f"{name}.lock", os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+
+
 def claim_cores(count: int) -> list:
     """Pin this process to up to ``count`` cores that no other of our Blender processes uses.
 
@@ -33,11 +43,10 @@ def claim_cores(count: int) -> list:
     for core in cores:
         if len(mine) == count:
             break
-        lock = open(Path(tempfile.gettempdir()) / f"neuma-blender-{os.getuid()}-{core}.lock", "w")
         try:
+            lock = open(own_lock(f"blender-{core}"), "w")
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            lock.close()
+        except OSError:  # another process has it, or there is no folder to write to
             continue
         locks.append(lock)
         mine.append(core)

@@ -21,7 +21,7 @@ import numpy as np
 from PIL import Image
 
 from neuma_lib.errors import InputError
-from neuma_lib.io.datasets.released import camera, image_name
+from neuma_lib.io.datasets.released import camera, image_name, is_path
 from neuma_lib.io.files import atomic, read_json, read_regular, reading
 from neuma_lib.io.images import (
     ImageSet,
@@ -134,7 +134,7 @@ def _spring_gaus(path: Path, numbers: Sequence[int]) -> tuple[Frames, None]:
     frames: Frames = {}
     for view, entry in enumerate(_entries(path)):
         folder = entry.get("camera") if isinstance(entry, dict) else None
-        if not isinstance(folder, str) or not folder or not folder.isprintable():
+        if not is_path(folder):
             raise InputError(f"{path}: entry {view}: camera", "must be the name of a folder of images")
         pinhole = camera(entry, f"{path}: entry {view} ({folder})", intrinsic="K")
         for number in numbers:

@@ -80,9 +80,19 @@ def check_pose(pose: np.ndarray, where: str) -> None:
 def image_name(entry: Any, where: str) -> str:
     """The ``file_path`` of an entry of a list of images. Raises InputError if it has none."""
     name = entry.get("file_path") if isinstance(entry, Mapping) else None
-    if not isinstance(name, str) or not name or not name.isprintable():
+    if not is_path(name):
         raise InputError(where, "has no file_path that is a text", "Check that this is a list of images")
     return name
+
+
+def is_path(name: Any) -> bool:
+    """Whether a value of a list can be a path: a printable text without parts that are too long for a file system."""
+    return (
+        isinstance(name, str)
+        and name.isprintable()
+        and 0 < len(name) < 2000
+        and all(len(part.encode()) < 250 for part in name.split("/"))
+    )
 
 
 def matrix_of_numbers(value: Any) -> np.ndarray:

@@ -10,6 +10,8 @@ import torch
 from torch import Tensor
 
 from neuma_lib.errors import InputError
+from neuma_lib.io.files import reading
+from neuma_lib.io.hdf5 import check_indices
 from neuma_lib.io.weights import read_weights, write_weights
 from neuma_lib.methods.spring_gaus.body import SpringBody
 from neuma_lib.methods.spring_gaus.network import SpringNetwork, Springs
@@ -46,8 +48,9 @@ def load_springs(path: str | Path, like: Tensor) -> tuple[Tensor, Springs, dict[
     if shapes != expected or not A or type(hard) is not int or not isinstance(exponent, float):
         raise InputError(path, "is not a network of springs", "Run the rule fit_spring_gaus again")
     neighbours, index = tensors["neighbours"], tensors["index"]
-    if not (0 <= int(neighbours.min()) and int(neighbours.max()) < A and 0 <= int(index.min())):
-        raise InputError(path, "refers to anchors that do not exist", "Run the rule fit_spring_gaus again")
+    with reading(path, "a network of springs"):
+        check_indices("neighbours", neighbours.numpy(), A)
+        check_indices("index", index.numpy())
     network = SpringNetwork(tensors["anchors"], neighbours, tensors["rest"], hard, exponent)
     springs = Springs(network.to(like.dtype, like.device), 1.0, 1.0)
     with torch.no_grad():
