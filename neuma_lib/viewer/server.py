@@ -18,7 +18,7 @@ from neuma_lib.errors import InputError
 from neuma_lib.extras import require
 from neuma_lib.geometry.shapes import NAMES
 from neuma_lib.splatting.spherical_harmonics import sh0_to_rgb
-from neuma_lib.viewer.live import EARTH, PIVOT, Snapshot
+from neuma_lib.viewer.live import EARTH, MAX_SPEED, PIVOT, Snapshot
 from neuma_lib.viewer.page import COLOURS
 from neuma_lib.viewer.playground import Picture, Playground
 from neuma_lib.viewer.scalars import QUANTITIES, rounded_up
@@ -55,6 +55,9 @@ class ViewerServer:
         playground: interactive simulation, or None.
         host: address to listen on; 127.0.0.1 is this machine only.
         port: to listen on; the next free one is used if it is occupied.
+
+    Raises:
+        InputError: an address that is not of this machine, no free port, or a release of viser that bypasses `Gate`.
     """
 
     def __init__(
@@ -62,7 +65,16 @@ class ViewerServer:
     ):
         self.scene, self.playground = scene, playground
         self.viser = viser()
-        self.server = self.viser.ViserServer(host=host, port=port, label=f"{scene.name}", verbose=False)
+        from neuma_lib.viewer.gate import Gate  # requires packages of viser
+
+        gate = Gate(host, port)
+        with gate.installed():
+            self.server = self.viser.ViserServer(
+                host=host, port=gate.port, label=f"{scene.name}", verbose=False
+            )
+        if self.port != gate.port:
+            self.server.stop()
+            raise InputError("viser", f"release {self.viser.__version__} is not supported", "Install viser 1.1.1")
         self._closing, self._dirty, self._playing = threading.Event(), True, False
         self._clock, self._number, self._nodes = 0.0, -1, {}
         self._reach: dict[tuple[str, str], float] = {}
@@ -70,6 +82,9 @@ class ViewerServer:
         self._text_time, self._trouble = 0.0, (None, None, None)
         self._room()
         self._controls()
+        gate.controls = {control._impl.uuid: control for control in self.gui.values()}
+        if playground:
+            gate.handles = (self._handle.name,)
         if playground:
             playground.simulation.run(False)
             playground.simulation.open()
@@ -128,6 +143,7 @@ class ViewerServer:
 
     def _controls(self) -> None:
         gui = self.server.gui
+        gui.configure_theme(show_share_button=False)
         self.gui: dict[str, Any] = {}
         add = self.gui
         modes = [RECORDED, LIVE] if self.playground else [RECORDED]
@@ -168,7 +184,10 @@ class ViewerServer:
             add["tilt z"] = gui.add_slider("tilt about z [°]", -30.0, 30.0, 1.0, 0.0)
             add["height"] = gui.add_slider("height [m]", 0.0, 0.9, 0.01, 0.4)
             add["drop"] = gui.add_button("Drop from there")
-            add["velocity"] = gui.add_vector3("velocity [m/s]", (1.0, 1.5, 0.0), step=0.1)
+            add["velocity"] = gui.add_vector3(
+                "velocity x, y (up), z [m/s]", (1.0, 1.5, 0.0),
+                min=(-MAX_SPEED,) * 3, max=(MAX_SPEED,) * 3, step=0.1,
+            )  # fmt: skip
             add["launch"] = gui.add_button("Launch")
             shapes = [f"letter_{c}" for c in string.ascii_uppercase]
             add["shape"] = gui.add_dropdown("solid", [*NAMES, *shapes], initial_value="letter_N")
