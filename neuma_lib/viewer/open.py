@@ -63,7 +63,7 @@ def view(
     for note in scene.notes:
         print(note, file=sys.stderr)
     if file:
-        size = write_page(Path(file), scene, viewer.particles, viewer.megabytes)
+        size = write_page(Path(file), scene, viewer.particles, viewer.megabytes, print)
         print(f"{file}: {len(scene.motions)} motions, {size / 1e6:.1f} MB; open it in a browser")
         return
     chosen = choose_device(device)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import string
 import threading
 import time
+from collections.abc import Sequence
 from types import ModuleType
 from typing import Any
 
@@ -38,6 +39,8 @@ _POLL = 0.05
 _TEXT_TIME = 0.5
 """Minimum time between updates of the status text [s], for legibility."""
 _FRUSTUM = 0.12
+_AXES = 0.15
+"""Length of the axes [m]."""
 _HANDLE = 0.55
 """Radius of the handle for dragging, in longest sides of the body."""
 
@@ -79,6 +82,7 @@ class ViewerServer:
         self._clock, self._number, self._nodes = 0.0, -1, {}
         self._reach: dict[tuple[str, str], float] = {}
         self._message: str | None = None
+        self._labels: list[Any] = []
         self._text_time, self._trouble = 0.0, (None, None, None)
         self._room()
         self._controls()
@@ -122,6 +126,9 @@ class ViewerServer:
                 position=(0.5, 0.0, 0.5), shadow_opacity=0.0,
             )  # fmt: skip
         self._nodes["right", "frame"] = scene.get_handle_by_name("/right")
+        scene.add_frame("/axes", axes_length=_AXES, axes_radius=0.03 * _AXES)
+        for name, place in (("x", (_AXES, 0, 0)), ("y (up)", (0, _AXES, 0)), ("z", (0, 0, _AXES))):
+            scene.add_label(f"/axes/{name}", name, position=place)
         camera = self.server.initial_camera
         target = self.scene.motions[0].x.mean(dim=(0, 1)).numpy()
         camera.look_at = target
@@ -143,7 +150,8 @@ class ViewerServer:
 
     def _controls(self) -> None:
         gui = self.server.gui
-        gui.configure_theme(show_share_button=False)
+        # the logo looks like axes with z up; sharing, which the gate rejects, would publish the server
+        gui.configure_theme(show_logo=False, show_share_button=False)
         self.gui: dict[str, Any] = {}
         add = self.gui
         modes = [RECORDED, LIVE] if self.playground else [RECORDED]
@@ -297,6 +305,7 @@ class ViewerServer:
         text = [f"**{1e3 * self.scene.dt * step:.0f} ms**"]
         self._turn(np.eye(3))
         with self.server.atomic():
+            self._label_bodies(())
             pair = display == DISTANCE
             self._draw_motion("left", left, step, display, right, text)
             if right and not pair:
@@ -355,10 +364,23 @@ class ViewerServer:
             else:
                 self._points("left", snapshot.x, play.values(snapshot, name), name)
             self._handle.position = snapshot.x[: snapshot.counts[0]].mean(dim=0).numpy()
+            self._label_bodies(snapshot.x.split(snapshot.counts))
         now, trouble = time.perf_counter(), (snapshot.trouble, snapshot.notice, self._message)
         if now - self._text_time > _TEXT_TIME or trouble != self._trouble:
             self._text_time, self._trouble = now, trouble
             self._set_status(self._live_text(snapshot))
+
+    def _label_bodies(self, bodies: Sequence[torch.Tensor]) -> None:
+        """Number and name above the particles (N, 3) of each of several bodies."""
+        texts = [f"{k + 1} {name}" for k, name in enumerate(self.playground.names)] if len(bodies) > 1 else []
+        for k in range(len(self._labels), len(texts)):
+            self._labels.append(self.server.scene.add_label(f"/left/box/label_{k}", "", anchor="bottom-center"))
+        for k, label in enumerate(self._labels):
+            label.visible = k < min(len(texts), len(bodies))
+            if label.visible:
+                low, high = bodies[k].aminmax(dim=0)
+                label.position = np.array([0.5 * (low + high)[0], high[1], 0.5 * (low + high)[2]])
+                label.text = texts[k]
 
     def _live_text(self, snapshot: Snapshot) -> str:
         lines = [
@@ -366,7 +388,7 @@ class ViewerServer:
             f"{len(snapshot.x)} particles, step {1e3 * snapshot.dt:.3g} ms"
         ]
         if snapshot.trouble:
-            lines.append(f"**Stopped: the simulation diverged.** {snapshot.trouble} — press *Reset*")
+            lines.append(f"**Stopped: the simulation diverged.** Press *Reset*. {snapshot.trouble}")
         if message := self._message or snapshot.notice:
             lines.append(f"*{message}*")
         return "  \n".join(lines)
