@@ -132,7 +132,7 @@ class Gate:
             return None
         try:
             message = _DECODER.decode(raw)
-        except (msgspec.DecodeError, RecursionError):
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
             return None
         if isinstance(message, GuiUpdateMessage):
             control = self.controls.get(message.uuid)
@@ -154,7 +154,7 @@ class Gate:
                 text = f"This server is open to {', '.join(sorted(self.names))}. See `neuma view --help`.\n"
                 return connection.respond(http.HTTPStatus.FORBIDDEN, text)
 
-            options |= {"max_size": MAX_BYTES, "create_connection": _connection(self)}
+            options |= {"max_size": MAX_BYTES, "close_timeout": 1, "create_connection": _connection(self)}
             return plain(handler, sock=self.socket, process_request=admitted, **options)
 
         websockets.serve = serve

@@ -346,8 +346,8 @@ class LiveSimulation:
         body = bisect.bisect(list(itertools.accumulate(self._counts)), error.particle or 0)
         law, dt = self._laws[body].name, 1e3 * min(self._dts)
         return (
-            f"Unstable law '{law}': a particle of body {body + 1} {error.happened}. Lower the speed, the height or the "
-            f"gravity, or choose a softer law. A smaller time step than {dt:g} ms needs a law that is trained with it "
+            f"Body {body + 1} is unstable under the law '{law}': a particle {error.happened}. Lower the speed, the height "
+            f"or the gravity, or choose a softer law. A smaller time step than {dt:g} ms needs a law that is trained with it "
             "(dt of its scene in the settings)."
         )
 

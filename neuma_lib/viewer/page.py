@@ -85,9 +85,7 @@ def roots(covars: Tensor) -> np.ndarray:
     return half[..., rows, columns].transpose(1, 2).numpy()
 
 
-def page(
-    scene: Scene, particles: int = 8000, megabytes: float = 25, log: Log = lambda text: None
-) -> str:
+def page(scene: Scene, particles: int = 8000, megabytes: float = 25, log: Log = lambda text: None) -> str:
     """The content of the file. It says which limits reduced it.
 
     Args:
@@ -103,7 +101,9 @@ def page(
     for motion in scene.motions:
         if (count := motion.x.shape[1]) > particles:
             shown = len(motion.x[0, :: _particle_stride(count, particles)])
-            limits.append(f"{motion.title}: {shown} of {count} particles (limit: viewer.particles = {particles})")
+            limits.append(
+                f"{motion.title}: {shown} of {count} particles (limit: viewer.particles = {particles})"
+            )
     while True:
         kept = tuple(steps[::stride]) if (len(steps) - 1) % stride == 0 else (*steps[::stride], steps[-1])
         dropped = f"{len(kept)} of {len(steps)} frames (limit: viewer.megabytes = {megabytes:g})"

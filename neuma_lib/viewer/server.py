@@ -5,7 +5,7 @@ from __future__ import annotations
 import string
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from types import ModuleType
 from typing import Any
 
@@ -77,11 +77,14 @@ class ViewerServer:
             )
         if self.port != gate.port:
             self.server.stop()
-            raise InputError("viser", f"release {self.viser.__version__} is not supported", "Install viser 1.1.1")
+            raise InputError(
+                "viser", f"release {self.viser.__version__} is not supported", "Install viser 1.1.1"
+            )
         self._closing, self._dirty, self._playing = threading.Event(), True, False
         self._clock, self._number, self._nodes = 0.0, -1, {}
         self._reach: dict[tuple[str, str], float] = {}
         self._message: str | None = None
+        self._acting, self._waiting = threading.Lock(), set()
         self._labels: list[Any] = []
         self._text_time, self._trouble = 0.0, (None, None, None)
         self._room()
@@ -215,9 +218,9 @@ class ViewerServer:
         }
         for name, act in actions.items():
             listen = add[name].on_click if hasattr(add[name], "on_click") else add[name].on_update
-            listen(lambda event, act=act: self._act(act))
+            listen(lambda event, name=name, act=act: self._act(name, act))
         # resetting the list after a rejected choice must not clear the message
-        add["law"].on_update(lambda event: value("law") != play.chosen and self._act(self._choose))
+        add["law"].on_update(lambda event: value("law") != play.chosen and self._act("law", self._choose))
         x = simulation.snapshot.x
         radius = _HANDLE * float((x.amax(dim=0) - x.amin(dim=0)).max())
         self._handle = self.server.scene.add_mesh_trimesh(
@@ -234,13 +237,22 @@ class ViewerServer:
             law.value = play.chosen
             raise InputError(notice)
 
-    def _act(self, act) -> None:
-        """Execute an action of the user, and display the message of an invalid one."""
-        try:
-            act()
-            self._message = None
-        except InputError as error:
-            self._message = str(error)
+    def _act(self, name: str, act: Callable[[], Any]) -> None:
+        """Execute an action of the user, and display the message of an invalid one.
+
+        Actions are executed one at a time with the current values of the controls. One that is already waiting is
+        not repeated, so that the clicks of one client cannot occupy all threads of viser.
+        """
+        if name in self._waiting:
+            return
+        self._waiting.add(name)
+        with self._acting:
+            self._waiting.discard(name)
+            try:
+                act()
+                self._message = None
+            except InputError as error:
+                self._message = str(error)
         self._dirty = True
 
     def _play(self, playing: bool) -> None:
@@ -374,7 +386,9 @@ class ViewerServer:
         """Number and name above the particles (N, 3) of each of several bodies."""
         texts = [f"{k + 1} {name}" for k, name in enumerate(self.playground.names)] if len(bodies) > 1 else []
         for k in range(len(self._labels), len(texts)):
-            self._labels.append(self.server.scene.add_label(f"/left/box/label_{k}", "", anchor="bottom-center"))
+            self._labels.append(
+                self.server.scene.add_label(f"/left/box/label_{k}", "", anchor="bottom-center")
+            )
         for k, label in enumerate(self._labels):
             label.visible = k < min(len(texts), len(bodies))
             if label.visible:

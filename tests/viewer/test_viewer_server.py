@@ -50,6 +50,8 @@ DRAG = {
     "owner": "",
 }
 
+SLIDER = {"type": "GuiUpdateMessage", "updates": {"value": 1e300}}
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
@@ -200,7 +202,13 @@ def test_clients_set_values_of_controls_in_their_ranges_alone(served):
             (gui["velocity"], 1.0), (gui["velocity"], [0.0, 0.0]), (gui["shape"], "../letter_N"),
         ):  # fmt: skip
             send(connection, update(control, value))
-        for name, value in (("removed", True), ("is_button", True), ("uuid", "0"), ("update_cb", []), ("props", 0)):
+        for name, value in (
+            ("removed", True),
+            ("is_button", True),
+            ("uuid", "0"),
+            ("update_cb", []),
+            ("props", 0),
+        ):
             send(connection, update(gui["gravity"], value, name))
         send(connection, {**update(gui["gravity"], 3.0), "updates": {"value": 3.0, "removed": True}})
         send(connection, update(gui["tilt x"], 20.0))  # permitted, and the last
@@ -225,13 +233,14 @@ def test_clients_set_values_of_controls_in_their_ranges_alone(served):
         {**DRAG, "end_position": ["a"]},  # not a number: ended the thread of the simulation
         {**DRAG, "end_position": [0.5, 0.5]},
         {**DRAG, "end_position": [float("nan")] * 3},
+        SLIDER,  # no client could be served any more
         {"type": "ShareUrlRequest"},  # opens a tunnel for everybody
     ],
 )
 def test_a_single_message_does_not_end_live_mode(served, monkeypatch, hostile):
     monkeypatch.setattr(served.server, "request_share_url", lambda *a: pytest.fail("a tunnel is opened"))
     with connected(served) as connection:
-        send(connection, hostile)
+        send(connection, hostile | ({"uuid": served.gui["frame"]._impl.uuid} if hostile is SLIDER else {}))
         send(connection, update(served.gui["frusta"], False))
         with contextlib.suppress(AssertionError):
             assert reached(lambda: not served.gui["frusta"].value, 2)
@@ -260,7 +269,12 @@ def mutated(random, server):
     kinds = [kind.__name__ for kind in viser._messages.Message.get_subclasses()]
     control = random.choice(list(server.gui.values()))
     valid = random.choice(
-        [CAMERA, DRAG, update(control, control.value), {"type": random.choice(kinds), "uuid": "0", "name": "/left"}]
+        [
+            CAMERA,
+            DRAG,
+            update(control, control.value),
+            {"type": random.choice(kinds), "uuid": "0", "name": "/left"},
+        ]
     )
     message = dict(valid)
     change = random.randrange(6)
@@ -283,7 +297,7 @@ def mutated(random, server):
     return bytes(raw)
 
 
-def test_the_server_survives_arbitrary_messages(served):
+def test_the_server_survives_arbitrary_messages(served, caplog):
     generator = random.Random(34)
     fixed = ["text", b"", b"\xc1", b"\x91" * 10_000, b"\xdd\xff\xff\xff\xff", b"\x00" * 1_000_000]
     left = [*fixed, *(mutated(generator, served) for _ in range(MESSAGES - len(fixed)))]
@@ -292,6 +306,7 @@ def test_the_server_survives_arbitrary_messages(served):
             while left:
                 connection.send(left.pop())
     check_it_serves(served)
+    assert not [record for record in caplog.records if record.exc_info], "no handler has failed"
 
 
 def test_a_flood_of_messages_ends_its_connection_alone(served):

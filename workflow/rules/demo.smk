@@ -10,6 +10,10 @@ rule film:
     output:
         mp4=f"{RESULTS}/{{scene}}/film{{slow}}.mp4",
         gif=f"{RESULTS}/{{scene}}/film{{slow}}.gif",
+    log:
+        f"{RESULTS}/logs/{{scene}}/film{{slow}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/{{scene}}/film{{slow}}.tsv"
     wildcard_constraints:
         slow=SLOW,
         scene=TRUE_SCENE,

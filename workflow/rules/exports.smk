@@ -78,6 +78,10 @@ rule export_film:
     output:
         film=f"{EXPORT}/motion{{slow}}.mp4",
         gif=f"{EXPORT}/motion{{slow}}.gif",
+    log:
+        f"{RESULTS}/logs/{{scene}}/{{method}}/export_film{{slow}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/{{scene}}/{{method}}/export_film{{slow}}.tsv"
     wildcard_constraints:
         slow=SLOW,
         scene=SCENE_OR_EXPERIMENT,
