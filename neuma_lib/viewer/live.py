@@ -7,9 +7,7 @@ box (`LiveSimulation.floor`).
 
 from __future__ import annotations
 
-import bisect
 import functools
-import itertools
 import queue
 import threading
 import time
@@ -295,8 +293,6 @@ class LiveSimulation:
             if moving:
                 try:
                     self._advance()
-                except NonFiniteError as error:
-                    self._trouble = self._diverged(error)
                 except InputError as error:
                     self._trouble = str(error)
                 except Exception as error:  # a reset must work whatever error a law raises
@@ -333,17 +329,34 @@ class LiveSimulation:
         steps = min(self._steps_per_frame, max(1, round(FRAME / model.dt)))
         if self._hand is not None:
             self._follow_hand(steps * model.dt)
-        with torch.no_grad():
-            bodies = consecutive(self._laws, self._counts)
-            path = rollout(model, bodies, self._state, steps=steps, frames=[steps], total=True)
-        self._take(path)
+        try:
+            self._take(self._simulated(steps))
+        except NonFiniteError as error:
+            self._trouble = self._diverged(error)
+            return
         self._time += steps * model.dt
         each = (time.perf_counter() - began) / steps
         self._steps_per_frame = max(1, min(int(BUSY / each), 2 * self._steps_per_frame))
 
+    def _simulated(self, steps: int) -> Trajectory:
+        bodies = consecutive(self._laws, self._counts)
+        with torch.no_grad():
+            return rollout(self.model, bodies, self._state, steps=steps, frames=[steps], total=True)
+
     def _diverged(self, error: NonFiniteError) -> str:
-        """The body that diverged, its law, and what the user can change."""
-        body = bisect.bisect(list(itertools.accumulate(self._counts)), error.particle or 0)
+        """The body that diverged, its law, and what the user can change.
+
+        The first particle that leaves may be of a body in contact. The cause is the body with the largest stress per
+        density, and thus acceleration, in the last valid step.
+        """
+        state, steps = self._state, (error.step or 1) - 1
+        F = self._simulated(steps).F[-1] if steps else state.F
+        pulls = []
+        for law, own, density in zip(self._laws, F.split(self._counts), state.density.split(self._counts), strict=True):
+            with torch.no_grad():
+                stress = law.elasticity.evaluate(own, law.elasticity.weights()).flatten(1).norm(dim=1)
+            pulls.append(float((stress / density).nan_to_num(nan=torch.inf).max()))
+        body = int(np.argmax(pulls))
         law, dt = self._laws[body].name, 1e3 * min(self._dts)
         return (
             f"Body {body + 1} is unstable under the law '{law}': a particle {error.happened}. Lower the speed, the height "
@@ -354,9 +367,8 @@ class LiveSimulation:
     def _take(self, path: Trajectory) -> None:
         x, v, F, C, total = (value[-1] for value in (path.x, path.v, path.F, path.C, path.F_total))
         for name, value in (("position", x), ("velocity", v), ("deformation", F)):
-            if not (finite := value.isfinite().flatten(1).all(dim=1)).all():
-                particle = int(finite.int().argmin())
-                raise NonFiniteError("live", f"a {name} is not finite", particle=particle)
+            if not value.isfinite().all():
+                raise NonFiniteError("live", f"a {name} is not finite")
         # the total deformation of the rollout starts from the initial F
         self._total = total @ torch.linalg.solve(self._state.F, self._total)
         self._state = replace(self._state, x=x, v=v, F=F, C=C)

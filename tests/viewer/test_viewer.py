@@ -109,6 +109,14 @@ def test_a_law_of_another_time_step_is_shown_at_the_same_times(tmp_path, scene):
     assert torch.allclose(again.scalars["speed"], motion_of(scene, "nclaw").scalars["speed"])
 
 
+def test_motions_of_one_title_get_their_names(folder):
+    from dataclasses import replace
+
+    files = find_scene(folder)[1]
+    same = replace(files, runs=tuple(replace(run, title="Mine") for run in files.runs))
+    assert [motion.title for motion in load_scene(same).motions] == ["Truth", "Mine (nclaw)", "Mine (constants)"]
+
+
 def test_cameras_have_their_images(scene):
     (view,) = scene.views
     assert sorted(view.images) == list(STEPS) and view.images[30].shape == (24, 32, 4)
@@ -216,12 +224,19 @@ def test_the_file_is_complete_and_reproducible(scene):
 
 def test_frames_are_dropped_from_a_file_that_is_too_large(scene):
     whole = len(page(scene))
-    smaller = page(scene, megabytes=0.95 * whole / 1e6)
+    said, limit = [], round(0.95 * whole / 1e6, 4)
+    smaller = page(scene, megabytes=limit, log=said.append)
     meta = json.loads(re.search(r'id="meta">(.*?)</script>', smaller, re.S)[1])
+    assert meta["limits"] == said == [f"2 of 4 frames (limit: viewer.megabytes = {limit:g})"]
     assert len(smaller) < 0.95 * whole and meta["steps"][0] == 0 and meta["steps"][-1] == STEPS[-1]
     with refused("viewer.megabytes"):
         page(scene, megabytes=0.01)
-    assert len(page(scene, particles=100)) < whole
+    said.clear()
+    assert len(page(scene, particles=300, log=said.append)) < whole
+    assert said[0] == "Truth: 300 of 900 particles (limit: viewer.particles = 300)" and len(said) == 3
+    said.clear()
+    page(scene, log=said.append)
+    assert not said
 
 
 def test_names_are_escaped(scene):

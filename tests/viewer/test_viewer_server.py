@@ -202,6 +202,18 @@ def test_only_pages_of_this_server_connect(shared, host, origin, accepted):
     plain.close()
 
 
+def test_a_server_for_other_machines_has_the_names_of_its_own(shared):
+    from neuma_lib.viewer.gate import Gate
+
+    gate, name = Gate("0.0.0.0", 0), socket.gethostname()
+    gate.socket.close()
+    for host in (name, f"{name}.local:8080", "192.0.2.5:80", "0.0.0.0", "localhost"):
+        assert gate.admits([host], [f"http://{host}"], local="192.0.2.5")
+    assert not gate.admits(["192.0.2.6"], [], local="192.0.2.5")
+    assert not gate.admits(["evil.example"], [], local="192.0.2.5")
+    assert not gate.admits([name, name], [], local="192.0.2.5")
+
+
 def test_clients_set_values_of_controls_in_their_ranges_alone(served):
     """Permitted values are executed, others have no effect."""
     gui, simulation = served.gui, served.playground.simulation
@@ -331,3 +343,38 @@ def test_a_flood_of_messages_ends_its_connection_alone(served):
             send(connection, update(served.gui["gravity"], random.uniform(0, 25)))
             time.sleep(1e-4)
     check_it_serves(served)
+
+
+# ---- what it says
+
+
+def test_axes_and_units_are_named_with_y_up(shared):
+    scene = shared.server.scene
+    assert scene.get_handle_by_name("/axes/y (up)").position[1] > 0.1
+    assert "x, y (up), z [m/s]" in shared.gui["velocity"].label
+
+
+def test_bodies_of_the_same_shape_have_labels(served):
+    play = served.playground
+    texts = lambda: [label.text for label in served._labels if label.visible]  # noqa: E731
+    assert reached(lambda: served._number > 0) and texts() == []
+    play.simulation.run(False)
+    play.simulation.drop(0.0)
+    for _ in range(2):
+        assert play.add("letter_I") is None
+    assert reached(lambda: len(texts()) == 3) and texts() == ["1 BouncyBall", "2 letter_I", "3 letter_I"]
+    heights = [label.position[1] for label in served._labels]
+    assert heights == sorted(heights)
+    play.reset()
+    assert reached(lambda: texts() == [])
+
+
+def test_a_diverged_simulation_says_what_to_change(served):
+    simulation = served.playground.simulation
+    simulation.drop(0.0)
+    simulation._dts[0] = 0.02  # beyond the Courant limit
+    simulation.launch((1.0, -1.0, 0.0))
+    assert reached(lambda: simulation.snapshot.trouble)
+    text = served._live_text(simulation.snapshot)
+    for words in ("*Reset*", "'BouncyBall: Constants'", "Body 1", "speed", "softer law", "smaller time step"):
+        assert words in text, text
