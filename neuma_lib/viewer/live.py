@@ -352,16 +352,18 @@ class LiveSimulation:
         state, steps = self._state, (error.step or 1) - 1
         F = self._simulated(steps).F[-1] if steps else state.F
         pulls = []
-        for law, own, density in zip(self._laws, F.split(self._counts), state.density.split(self._counts), strict=True):
+        for law, own, density in zip(
+            self._laws, F.split(self._counts), state.density.split(self._counts), strict=True
+        ):
             with torch.no_grad():
                 stress = law.elasticity.evaluate(own, law.elasticity.weights()).flatten(1).norm(dim=1)
             pulls.append(float((stress / density).nan_to_num(nan=torch.inf).max()))
         body = int(np.argmax(pulls))
         law, dt = self._laws[body].name, 1e3 * min(self._dts)
         return (
-            f"Body {body + 1} is unstable under the law '{law}': a particle {error.happened}. Lower the speed, the height "
-            f"or the gravity, or choose a softer law. A smaller time step than {dt:g} ms needs a law that is trained with it "
-            "(dt of its scene in the settings)."
+            f"Body {body + 1} is unstable under the law '{law}': a particle {error.happened}. Lower the speed, the "
+            f"height or the gravity, or choose a softer law. A smaller time step than {dt:g} ms needs a law that is "
+            "trained with it (dt of its scene in the settings)."
         )
 
     def _take(self, path: Trajectory) -> None:

@@ -86,7 +86,7 @@ def roots(covars: Tensor) -> np.ndarray:
 
 
 def page(scene: Scene, particles: int = 8000, megabytes: float = 25, log: Log = lambda text: None) -> str:
-    """The content of the file. It says which limits reduced it.
+    """The content of the file, with the limits that reduced it.
 
     Args:
         particles: maximum number of particles per motion; more are subsampled evenly.

@@ -345,7 +345,7 @@ def test_a_flood_of_messages_ends_its_connection_alone(served):
     check_it_serves(served)
 
 
-# ---- what it says
+# ---- messages
 
 
 def test_axes_and_units_are_named_with_y_up(shared):
@@ -369,7 +369,7 @@ def test_bodies_of_the_same_shape_have_labels(served):
     assert reached(lambda: texts() == [])
 
 
-def test_a_diverged_simulation_says_what_to_change(served):
+def test_a_diverged_simulation_names_what_to_change(served):
     simulation = served.playground.simulation
     simulation.drop(0.0)
     simulation._dts[0] = 0.02  # beyond the Courant limit
