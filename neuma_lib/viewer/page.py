@@ -100,9 +100,9 @@ def page(scene: Scene, particles: int = 8000, megabytes: float = 25, log: Log = 
     stride, limits = 1, []
     for motion in scene.motions:
         if (count := motion.x.shape[1]) > particles:
-            shown = len(motion.x[0, :: _particle_stride(count, particles)])
+            drawn = len(motion.x[0, :: _particle_stride(count, particles)])
             limits.append(
-                f"{motion.title}: {shown} of {count} particles (limit: viewer.particles = {particles})"
+                f"{motion.title}: {drawn} of {count} particles (limit: viewer.particles = {particles})"
             )
     while True:
         kept = tuple(steps[::stride]) if (len(steps) - 1) % stride == 0 else (*steps[::stride], steps[-1])
