@@ -211,6 +211,6 @@ def listening(host: str, port: int) -> socket.socket:
             if getattr(error, "errno", None) == errno.EADDRINUSE:
                 continue
             remedy = "Use an address of this machine, such as 127.0.0.1, or 0.0.0.0 for all of its addresses"
-            problem = f"cannot listen there at port {each}: {getattr(error, 'strerror', None) or error}"
-            raise InputError(f"--host {host}", problem, remedy) from None
+            reason = str(error.args[-1]).partition(" (while")[0]
+            raise InputError(f"--host {host}", f"cannot listen at port {each}: {reason}", remedy) from None
     raise InputError(f"--port {port}", f"is in use, and so are the ports up to {each}", "Choose another one")
