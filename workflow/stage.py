@@ -78,7 +78,7 @@ def stage(name: str, log: str | Path | None = None, stream: TextIO | None = None
 
 def run_script(main: Callable, snakemake) -> None:
     """Run ``main(input, output, params, run)`` of a script as the stage of its rule and wildcards."""
-    name = " ".join(filter(None, [snakemake.rule, "/".join(snakemake.wildcards)]))
+    name = " ".join(filter(None, [snakemake.rule, "/".join(filter(None, snakemake.wildcards))]))
     started = _core_seconds()  # of the interpreter and all imports
     with stage(name, snakemake.log[0]) as run:
         _LOG_LOGGER.info(versions.line())

@@ -61,7 +61,8 @@ def copy_pictures(pictures: Mapping[str, Path], target: str | Path) -> dict[str,
     for name, file in pictures.items():
         content = read_regular(file)
         with open_image(content, file) as image:
-            rotated = image.getexif().get(ORIENTATION, 1) != 1
+            with reading(file, "an image"):
+                rotated = image.getexif().get(ORIENTATION, 1) != 1
             with atomic(copies[name]) as partial:
                 if not rotated:
                     shutil.copyfile(file, partial)

@@ -214,20 +214,23 @@ class LiveSimulation:
 
     @_queued
     def launch(self, velocity: Sequence[float]) -> None:
-        """Set a uniform velocity of the first body [m/s], in the room's axes."""
+        """Set a uniform velocity of the first body [m/s], in the room's axes, of at most `MAX_SPEED`."""
         self._hand = None
         self._set_velocity(self.to_box(velocity))
+        if (speed := float(np.linalg.norm(velocity))) > MAX_SPEED:
+            self._notice = f"The speed of {speed:.3g} m/s is limited to {MAX_SPEED:g} m/s."
 
     @_queued
     def drop(self, height: float) -> None:
-        """Move the first body, undeformed and at rest, to a height above the floor [m]."""
+        """Move the first body, undeformed and at rest, to a height above the floor [m], below the ceiling."""
         if not np.isfinite(height):
             raise InputError("height", "is not a number")
         start, own = self._start, self._first()
         low, high = (float(end) for end in torch.aminmax(start.x[:, 1]))
         highest = 1 - _GAP * self.model.dx - (high - low)
         lifted = start.x.clone()
-        lifted[:, 1] += min(max(height, 0.0), max(highest, 0.0)) - low
+        reached = min(max(height, 0.0), max(highest, 0.0))
+        lifted[:, 1] += reached - low
         state, rest = self._state, _undeformed(lifted)
         old = (state.x, state.v.expand_as(state.x), state.F, state.C, self._total)
         x, v, F, C, total = (array.clone() for array in old)
@@ -235,11 +238,16 @@ class LiveSimulation:
         self._state, self._total, self._hand = replace(state, x=x, v=v, F=F, C=C), total, None
         if len(self._counts) == 1:
             self._trouble = None  # the diverged state is gone
+        if height > reached:
+            self._notice = f"The height of {height:.3g} m is limited to {reached:.2f} m by the ceiling."
 
     @_queued
     def hold(self, place: Sequence[float] | None) -> None:
         """Pull the centre of the first body to a point [m], in the room's axes; None releases it."""
-        self._hand = None if place is None else np.array(place, float)
+        place = None if place is None else np.array(place, float)
+        if place is not None and not (place.shape == (3,) and np.isfinite(place).all()):
+            raise InputError("hold", f"{place} is not a point")
+        self._hand = place
 
     @_queued
     def add(self, body: State, law: Law, dt: float) -> None:
@@ -285,7 +293,7 @@ class LiveSimulation:
             if moving:
                 try:
                     self._advance()
-                except (InputError, NonFiniteError) as error:
+                except InputError as error:
                     self._trouble = str(error)
                 except Exception as error:  # a reset must work whatever error a law raises
                     self._trouble = f"{type(error).__name__}: {error}"
@@ -302,6 +310,8 @@ class LiveSimulation:
             command()
         except InputError as error:
             self._notice = str(error)
+        except Exception as error:  # a command must not end the thread
+            self._notice = f"{type(error).__name__}: {error}"
 
     def _rest(self, until: float, moving: bool) -> None:
         """Execute commands until a time of the clock, or only one command if nothing moves."""
@@ -319,19 +329,48 @@ class LiveSimulation:
         steps = min(self._steps_per_frame, max(1, round(FRAME / model.dt)))
         if self._hand is not None:
             self._follow_hand(steps * model.dt)
-        with torch.no_grad():
-            bodies = consecutive(self._laws, self._counts)
-            path = rollout(model, bodies, self._state, steps=steps, frames=[steps], total=True)
-        self._take(path)
+        try:
+            self._take(self._simulated(steps))
+        except NonFiniteError as error:
+            self._trouble = self._diverged(error)
+            return
         self._time += steps * model.dt
         each = (time.perf_counter() - began) / steps
         self._steps_per_frame = max(1, min(int(BUSY / each), 2 * self._steps_per_frame))
+
+    def _simulated(self, steps: int) -> Trajectory:
+        bodies = consecutive(self._laws, self._counts)
+        with torch.no_grad():
+            return rollout(self.model, bodies, self._state, steps=steps, frames=[steps], total=True)
+
+    def _diverged(self, error: NonFiniteError) -> str:
+        """The body that diverged, its law, and what the user can change.
+
+        The first particle that leaves may be of a body in contact. The cause is the body with the largest stress per
+        density, and thus acceleration, in the last valid step.
+        """
+        state, steps = self._state, (error.step or 1) - 1
+        F = self._simulated(steps).F[-1] if steps else state.F
+        pulls = []
+        for law, own, density in zip(
+            self._laws, F.split(self._counts), state.density.split(self._counts), strict=True
+        ):
+            with torch.no_grad():
+                stress = law.elasticity.evaluate(own, law.elasticity.weights()).flatten(1).norm(dim=1)
+            pulls.append(float((stress / density).nan_to_num(nan=torch.inf).max()))
+        body = int(np.argmax(pulls))
+        law, dt = self._laws[body].name, 1e3 * min(self._dts)
+        return (
+            f"Body {body + 1} is unstable under the law '{law}': a particle {error.happened}. Lower the speed, the "
+            f"height or the gravity, or choose a softer law. A smaller time step than {dt:g} ms needs a law that is "
+            "trained with it (dt of its scene in the settings)."
+        )
 
     def _take(self, path: Trajectory) -> None:
         x, v, F, C, total = (value[-1] for value in (path.x, path.v, path.F, path.C, path.F_total))
         for name, value in (("position", x), ("velocity", v), ("deformation", F)):
             if not value.isfinite().all():
-                raise NonFiniteError("live", f"a {name} is not finite: the law diverges here")
+                raise NonFiniteError("live", f"a {name} is not finite")
         # the total deformation of the rollout starts from the initial F
         self._total = total @ torch.linalg.solve(self._state.F, self._total)
         self._state = replace(self._state, x=x, v=v, F=F, C=C)

@@ -40,7 +40,8 @@ def view(
         device: where the live mode simulates: "auto", "cpu" or "cuda".
 
     Raises:
-        InputError: the folder is not that of a scene or has no motion, or viser is missing (extra ``viewer``).
+        InputError: the folder is not that of a scene or has no motion, viser is missing (extra ``viewer``), or the
+            address is not of this machine or has no free port.
 
     Example:
         >>> view("results/BouncyBall", file="ball.html")
@@ -48,6 +49,9 @@ def view(
     """
     if not file:
         viser()  # fails before anything is read
+        from neuma_lib.viewer.gate import listening  # requires packages of viser
+
+        listening(host, port).close()
     settings, files = find_scene(folder, configfiles)
     if methods:
         known = {run.name: run for run in files.runs}
@@ -59,7 +63,7 @@ def view(
     for note in scene.notes:
         print(note, file=sys.stderr)
     if file:
-        size = write_page(Path(file), scene, viewer.particles, viewer.megabytes)
+        size = write_page(Path(file), scene, viewer.particles, viewer.megabytes, print)
         print(f"{file}: {len(scene.motions)} motions, {size / 1e6:.1f} MB; open it in a browser")
         return
     chosen = choose_device(device)
@@ -68,7 +72,10 @@ def view(
     playground = Playground(files, laws, first_law(files, laws), chosen) if laws else None
     server = ViewerServer(scene, playground, host, port)
     counts = f"{len(scene.motions)} motions, {len(laws)} laws"
-    print(f"http://{server.host}:{server.port}  ({counts}; Ctrl-C ends it)")
+    if port not in (0, server.port):
+        print(f"Port {port} is in use.", file=sys.stderr)
+    address = f"[{host}]" if ":" in host else "localhost" if host == "0.0.0.0" else host
+    print(f"http://{address}:{server.port}  ({counts}; Ctrl-C ends it)")
     try:
         threading.Event().wait()
     except KeyboardInterrupt:

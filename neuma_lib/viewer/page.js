@@ -458,7 +458,7 @@ function changed() {
     if (what === "seen" && !motion.means) notes.unshift(`${motion.title} carries no Gaussians: show its particles.`);
     if (meta.quantities[what] && !motion.scalars[what]) notes.unshift(`${motion.title}: ${legend.label} is not known.`);
   }
-  byId("message").textContent = notes.join("\n");
+  byId("message").textContent = [...notes, ...meta.limits].join("\n");
   byId("legend").hidden = !legend;
   if (legend) {
     byId("quantity").textContent = legend.label;
@@ -507,16 +507,18 @@ function controls() {
   byId("time").max = meta.steps.length - 1;
   for (const id of ["left", "right", "show", "camera", "frusta", "box"]) byId(id).addEventListener("change", changed);
   byId("time").addEventListener("input", () => { state.playing = false; state.frame = +byId("time").value; label(); state.dirty = true; });
-  byId("play").addEventListener("click", () => {
-    state.playing = !state.playing;
-    if (state.playing && state.frame === meta.steps.length - 1) state.frame = 0;
-    state.clock = meta.dt * meta.steps[state.frame];
-    label();
-  });
+  byId("play").addEventListener("click", () => play(!state.playing));
   window.addEventListener("resize", () => { state.dirty = true; });
   byId("notes").hidden = !meta.notes.length;
   byId("notes").lastElementChild.textContent = meta.notes.join("\n");
   pointer();
+}
+
+function play(playing) {
+  state.playing = playing;
+  if (playing && state.frame === meta.steps.length - 1) state.frame = 0;
+  state.clock = meta.dt * meta.steps[state.frame];
+  label();
 }
 
 function label() { byId("play").textContent = state.playing ? "Pause" : "Play"; }
@@ -588,6 +590,7 @@ async function main() {
   home();
   controls();
   changed();
+  play(!matchMedia("(prefers-reduced-motion: reduce)").matches);
   document.body.dataset.state = "ready";
   requestAnimationFrame((now) => { state.last = now; tick(now); });
 }

@@ -23,7 +23,7 @@ from neuma_lib.errors import InputError
 from neuma_lib.extras import require
 from neuma_lib.io.files import write_text
 from neuma_lib.viewer.scalars import QUANTITIES
-from neuma_lib.viewer.scene import Motion, Scene, View, frame_at
+from neuma_lib.viewer.scene import Log, Motion, Scene, View, frame_at
 
 COLOURS = {None: "viridis", 1.0: "coolwarm"}
 """Centre of a quantity's range -> colour map."""
@@ -85,22 +85,33 @@ def roots(covars: Tensor) -> np.ndarray:
     return half[..., rows, columns].transpose(1, 2).numpy()
 
 
-def page(scene: Scene, particles: int = 8000, megabytes: float = 25) -> str:
-    """The content of the file.
+def page(scene: Scene, particles: int = 8000, megabytes: float = 25, log: Log = lambda text: None) -> str:
+    """The content of the file, with the limits that reduced it.
 
     Args:
         particles: maximum number of particles per motion; more are subsampled evenly.
         megabytes: maximum size of the file [MB]; every second frame is dropped repeatedly until it fits.
+        log: callback for these messages.
 
     Raises:
         InputError: first and last frame do not fit.
     """
     steps = scene.steps
-    stride = 1
+    stride, limits = 1, []
+    for motion in scene.motions:
+        if (count := motion.x.shape[1]) > particles:
+            drawn = len(motion.x[0, :: _particle_stride(count, particles)])
+            limits.append(
+                f"{motion.title}: {drawn} of {count} particles (limit: viewer.particles = {particles})"
+            )
     while True:
         kept = tuple(steps[::stride]) if (len(steps) - 1) % stride == 0 else (*steps[::stride], steps[-1])
-        text = _filled(scene, kept, particles)
+        dropped = f"{len(kept)} of {len(steps)} frames (limit: viewer.megabytes = {megabytes:g})"
+        reached = [*limits, dropped] if len(kept) < len(steps) else limits
+        text = _filled(scene, kept, particles, reached)
         if len(text) <= megabytes * 1e6:
+            for limit in reached:
+                log(limit)
             return text
         if len(kept) <= 2:
             problem = (
@@ -111,14 +122,20 @@ def page(scene: Scene, particles: int = 8000, megabytes: float = 25) -> str:
         stride *= 2
 
 
-def write_page(path: str | Path, scene: Scene, particles: int = 8000, megabytes: float = 25) -> int:
+def write_page(
+    path: str | Path, scene: Scene, particles: int = 8000, megabytes: float = 25, log: Log = lambda text: None
+) -> int:
     """Write `page` and return its size in bytes."""
-    text = page(scene, particles, megabytes)
+    text = page(scene, particles, megabytes, log)
     write_text(path, text)
     return len(text)
 
 
-def _filled(scene: Scene, steps: tuple[int, ...], particles: int) -> str:
+def _particle_stride(count: int, particles: int) -> int:
+    return -(-count // particles)
+
+
+def _filled(scene: Scene, steps: tuple[int, ...], particles: int, limits: list[str]) -> str:
     blob, g = Blob(), scene.gaussians
     sh = g.sh().permute(1, 2, 0).reshape(1, -1, len(g)).numpy()
     known = {name: quantity for name, quantity in QUANTITIES.items() if name in scene.ranges}
@@ -143,6 +160,7 @@ def _filled(scene: Scene, steps: tuple[int, ...], particles: int) -> str:
         },
         "maps": {name: colour_map(name) for name in COLOURS.values()},
         "notes": list(scene.notes),
+        "limits": limits,
     }
     packed = zlib.compress(b"".join(blob.parts), 9)
     parts = {
@@ -164,7 +182,7 @@ def colour_map(name: str) -> list[int]:
 
 def _motion(scene: Scene, motion: Motion, steps: tuple[int, ...], particles: int, blob: Blob) -> dict:
     at = [frame_at(motion.steps, step) for step in steps]
-    stride = -(-motion.x.shape[1] // particles)
+    stride = _particle_stride(motion.x.shape[1], particles)
     x = motion.x[at, ::stride]
     radius = (scene.volume / x.shape[1] * 3 / (4 * np.pi)) ** (1 / 3)
     content: dict[str, Any] = {

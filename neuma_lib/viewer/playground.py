@@ -52,6 +52,9 @@ class Playground:
         chosen: initial law.
         device: of the simulation; Gaussians are deformed on the CPU.
 
+    Attributes:
+        names: of the bodies.
+
     Raises:
         InputError: files of the body or of the law are damaged or outside the permitted folders (`files.inside`).
     """
@@ -74,7 +77,7 @@ class Playground:
         self._density = (
             files.density if isinstance(files.density, int | float) else float(start.density.mean())
         )
-        self._bodies, self._whole = [first], [first]
+        self._bodies, self._whole, self.names = [first], [first], [files.name]
         self._arms: dict[int, Tensor] = {}
         self._loaded: dict[str, Law] = {}
         self._constants, self._start = dict(files.simulation), start.to(device)
@@ -90,6 +93,7 @@ class Playground:
             raise InputError("law", f"'{name}' is unknown", f"Choose one of {', '.join(self.laws)}")
         if name not in self._loaded:
             law = self.laws[name].load(self._checked).law.requires_grad_(False).to(self.device)
+            law.name = name  # messages name it as the list of laws does
             self._try(law, self.laws[name].dt)
             self._loaded[name] = law
         return self._loaded[name]
@@ -119,7 +123,7 @@ class Playground:
         with self._changing:
             self.simulation.reset()
             self.simulation.do()
-            del self._bodies[1:], self._whole[1:]
+            del self._bodies[1:], self._whole[1:], self.names[1:]
 
     def add(self, shape: str) -> str | None:
         """Drop a solid with the current law onto the others. Returns the reason if it is impossible."""
@@ -129,12 +133,13 @@ class Playground:
             colour = torch.tensor(_COLOURS[(len(self._bodies) - 1) % len(_COLOURS)])
             body = coloured_solid(mesh, x0, self._density, colour.expand(len(x0), 3))
             self._bodies.append(body)
+            self.names.append(shape)
             self._whole.append(join(self._bodies))
             at_rest = body.state((0.0, 0.0, 0.0)).to(self.device)
             self.simulation.add(at_rest, self.law(self.chosen), self.laws[self.chosen].dt)
             notice = self.simulation.do().notice
             if notice:
-                del self._bodies[-1], self._whole[-1]
+                del self._bodies[-1], self._whole[-1], self.names[-1]
         return notice
 
     def picture(self, snapshot: Snapshot, flow: bool = False) -> Picture:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -132,6 +132,11 @@ def load_scene(
             if not skip_damaged:
                 raise
             notes.append(f"{run.title} is left out: {one_line(error)}")
+    titles = [motion.title for motion in motions]
+    motions = [
+        replace(motion, title=f"{motion.title} ({motion.name})") if titles.count(motion.title) > 1 else motion
+        for motion in motions
+    ]
     if not motions:
         command = f"snakemake --cores 2 results/{files.name}/<method>/rollout.h5"
         raise InputError(files.name, "has no motion", f"Compute one with `{command}`")

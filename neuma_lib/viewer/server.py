@@ -5,6 +5,7 @@ from __future__ import annotations
 import string
 import threading
 import time
+from collections.abc import Callable, Sequence
 from types import ModuleType
 from typing import Any
 
@@ -18,7 +19,7 @@ from neuma_lib.errors import InputError
 from neuma_lib.extras import require
 from neuma_lib.geometry.shapes import NAMES
 from neuma_lib.splatting.spherical_harmonics import sh0_to_rgb
-from neuma_lib.viewer.live import EARTH, PIVOT, Snapshot
+from neuma_lib.viewer.live import EARTH, MAX_SPEED, PIVOT, Snapshot
 from neuma_lib.viewer.page import COLOURS
 from neuma_lib.viewer.playground import Picture, Playground
 from neuma_lib.viewer.scalars import QUANTITIES, rounded_up
@@ -38,6 +39,8 @@ _POLL = 0.05
 _TEXT_TIME = 0.5
 """Minimum time between updates of the status text [s], for legibility."""
 _FRUSTUM = 0.12
+_AXES = 0.15
+"""Length of the axes [m]."""
 _HANDLE = 0.55
 """Radius of the handle for dragging, in longest sides of the body."""
 
@@ -55,6 +58,9 @@ class ViewerServer:
         playground: interactive simulation, or None.
         host: address to listen on; 127.0.0.1 is this machine only.
         port: to listen on; the next free one is used if it is occupied.
+
+    Raises:
+        InputError: an address that is not of this machine, no free port, or a release of viser that bypasses `Gate`.
     """
 
     def __init__(
@@ -62,14 +68,30 @@ class ViewerServer:
     ):
         self.scene, self.playground = scene, playground
         self.viser = viser()
-        self.server = self.viser.ViserServer(host=host, port=port, label=f"{scene.name}", verbose=False)
+        from neuma_lib.viewer.gate import Gate  # requires packages of viser
+
+        gate = Gate(host, port)
+        with gate.installed():
+            self.server = self.viser.ViserServer(
+                host=host, port=gate.port, label=f"{scene.name}", verbose=False
+            )
+        if self.port != gate.port:
+            self.server.stop()
+            raise InputError(
+                "viser", f"release {self.viser.__version__} is not supported", "Install viser 1.1.1"
+            )
         self._closing, self._dirty, self._playing = threading.Event(), True, False
         self._clock, self._number, self._nodes = 0.0, -1, {}
         self._reach: dict[tuple[str, str], float] = {}
         self._message: str | None = None
+        self._acting, self._waiting = threading.Lock(), set()
+        self._labels: list[Any] = []
         self._text_time, self._trouble = 0.0, (None, None, None)
         self._room()
         self._controls()
+        gate.controls = {control._impl.uuid: control for control in self.gui.values()}
+        if playground:
+            gate.handles = (self._handle.name,)
         if playground:
             playground.simulation.run(False)
             playground.simulation.open()
@@ -107,6 +129,9 @@ class ViewerServer:
                 position=(0.5, 0.0, 0.5), shadow_opacity=0.0,
             )  # fmt: skip
         self._nodes["right", "frame"] = scene.get_handle_by_name("/right")
+        scene.add_frame("/axes", axes_length=_AXES, axes_radius=0.03 * _AXES)
+        for name, place in (("x", (_AXES, 0, 0)), ("y (up)", (0, _AXES, 0)), ("z", (0, 0, _AXES))):
+            scene.add_label(f"/axes/{name}", name, position=place)
         camera = self.server.initial_camera
         target = self.scene.motions[0].x.mean(dim=(0, 1)).numpy()
         camera.look_at = target
@@ -128,6 +153,8 @@ class ViewerServer:
 
     def _controls(self) -> None:
         gui = self.server.gui
+        # the logo looks like axes with z up; sharing, which the gate rejects, would publish the server
+        gui.configure_theme(show_logo=False, show_share_button=False)
         self.gui: dict[str, Any] = {}
         add = self.gui
         modes = [RECORDED, LIVE] if self.playground else [RECORDED]
@@ -168,7 +195,10 @@ class ViewerServer:
             add["tilt z"] = gui.add_slider("tilt about z [°]", -30.0, 30.0, 1.0, 0.0)
             add["height"] = gui.add_slider("height [m]", 0.0, 0.9, 0.01, 0.4)
             add["drop"] = gui.add_button("Drop from there")
-            add["velocity"] = gui.add_vector3("velocity [m/s]", (1.0, 1.5, 0.0), step=0.1)
+            add["velocity"] = gui.add_vector3(
+                "velocity x, y (up), z [m/s]", (1.0, 1.5, 0.0),
+                min=(-MAX_SPEED,) * 3, max=(MAX_SPEED,) * 3, step=0.1,
+            )  # fmt: skip
             add["launch"] = gui.add_button("Launch")
             shapes = [f"letter_{c}" for c in string.ascii_uppercase]
             add["shape"] = gui.add_dropdown("solid", [*NAMES, *shapes], initial_value="letter_N")
@@ -188,9 +218,9 @@ class ViewerServer:
         }
         for name, act in actions.items():
             listen = add[name].on_click if hasattr(add[name], "on_click") else add[name].on_update
-            listen(lambda event, act=act: self._act(act))
+            listen(lambda event, name=name, act=act: self._act(name, act))
         # resetting the list after a rejected choice must not clear the message
-        add["law"].on_update(lambda event: value("law") != play.chosen and self._act(self._choose))
+        add["law"].on_update(lambda event: value("law") != play.chosen and self._act("law", self._choose))
         x = simulation.snapshot.x
         radius = _HANDLE * float((x.amax(dim=0) - x.amin(dim=0)).max())
         self._handle = self.server.scene.add_mesh_trimesh(
@@ -207,13 +237,22 @@ class ViewerServer:
             law.value = play.chosen
             raise InputError(notice)
 
-    def _act(self, act) -> None:
-        """Execute an action of the user, and display the message of an invalid one."""
-        try:
-            act()
-            self._message = None
-        except InputError as error:
-            self._message = str(error)
+    def _act(self, name: str, act: Callable[[], Any]) -> None:
+        """Execute an action of the user, and display the message of an invalid one.
+
+        Actions are executed one at a time with the current values of the controls. One that is already waiting is
+        not repeated, so that the clicks of one client cannot occupy all threads of viser.
+        """
+        if name in self._waiting:
+            return
+        self._waiting.add(name)
+        with self._acting:
+            self._waiting.discard(name)
+            try:
+                act()
+                self._message = None
+            except InputError as error:
+                self._message = str(error)
         self._dirty = True
 
     def _play(self, playing: bool) -> None:
@@ -278,6 +317,7 @@ class ViewerServer:
         text = [f"**{1e3 * self.scene.dt * step:.0f} ms**"]
         self._turn(np.eye(3))
         with self.server.atomic():
+            self._label_bodies(())
             pair = display == DISTANCE
             self._draw_motion("left", left, step, display, right, text)
             if right and not pair:
@@ -336,10 +376,25 @@ class ViewerServer:
             else:
                 self._points("left", snapshot.x, play.values(snapshot, name), name)
             self._handle.position = snapshot.x[: snapshot.counts[0]].mean(dim=0).numpy()
+            self._label_bodies(snapshot.x.split(snapshot.counts))
         now, trouble = time.perf_counter(), (snapshot.trouble, snapshot.notice, self._message)
         if now - self._text_time > _TEXT_TIME or trouble != self._trouble:
             self._text_time, self._trouble = now, trouble
             self._set_status(self._live_text(snapshot))
+
+    def _label_bodies(self, bodies: Sequence[torch.Tensor]) -> None:
+        """Number and name above the particles (N, 3) of each of several bodies."""
+        texts = [f"{k + 1} {name}" for k, name in enumerate(self.playground.names)] if len(bodies) > 1 else []
+        for k in range(len(self._labels), len(texts)):
+            self._labels.append(
+                self.server.scene.add_label(f"/left/box/label_{k}", "", anchor="bottom-center")
+            )
+        for k, label in enumerate(self._labels):
+            label.visible = k < min(len(texts), len(bodies))
+            if label.visible:
+                low, high = bodies[k].aminmax(dim=0)
+                label.position = np.array([0.5 * (low + high)[0], high[1], 0.5 * (low + high)[2]])
+                label.text = texts[k]
 
     def _live_text(self, snapshot: Snapshot) -> str:
         lines = [
@@ -347,7 +402,7 @@ class ViewerServer:
             f"{len(snapshot.x)} particles, step {1e3 * snapshot.dt:.3g} ms"
         ]
         if snapshot.trouble:
-            lines.append(f"**Stopped: the simulation diverged.** {snapshot.trouble} — press *Reset*")
+            lines.append(f"**Stopped: the simulation diverged.** Press *Reset*. {snapshot.trouble}")
         if message := self._message or snapshot.notice:
             lines.append(f"*{message}*")
         return "  \n".join(lines)

@@ -64,6 +64,7 @@ TARGETS = [
     *(f"{SCENE}/true_law/metrics.json", f"{SCENE}/neuma/image_metrics.json"),
     *(f"{OWN_PARTICLES}/metrics.json", f"{OWN_PARTICLES}/video.mp4", f"{RESULTS}/figures/main_res.png"),
     *(f"{folder}/export/{file}" for folder in EXPORTED for file in EXPORTS),
+    f"{SCENE}/{SPRINGS}/export/motion_slow4.gif",
 ]
 
 

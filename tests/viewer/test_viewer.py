@@ -109,6 +109,18 @@ def test_a_law_of_another_time_step_is_shown_at_the_same_times(tmp_path, scene):
     assert torch.allclose(again.scalars["speed"], motion_of(scene, "nclaw").scalars["speed"])
 
 
+def test_motions_of_one_title_get_their_names(folder):
+    from dataclasses import replace
+
+    files = find_scene(folder)[1]
+    same = replace(files, runs=tuple(replace(run, title="Mine") for run in files.runs))
+    assert [motion.title for motion in load_scene(same).motions] == [
+        "Truth",
+        "Mine (nclaw)",
+        "Mine (constants)",
+    ]
+
+
 def test_cameras_have_their_images(scene):
     (view,) = scene.views
     assert sorted(view.images) == list(STEPS) and view.images[30].shape == (24, 32, 4)
@@ -216,12 +228,19 @@ def test_the_file_is_complete_and_reproducible(scene):
 
 def test_frames_are_dropped_from_a_file_that_is_too_large(scene):
     whole = len(page(scene))
-    smaller = page(scene, megabytes=0.95 * whole / 1e6)
+    logged, limit = [], round(0.95 * whole / 1e6, 4)
+    smaller = page(scene, megabytes=limit, log=logged.append)
     meta = json.loads(re.search(r'id="meta">(.*?)</script>', smaller, re.S)[1])
+    assert meta["limits"] == logged == [f"2 of 4 frames (limit: viewer.megabytes = {limit:g})"]
     assert len(smaller) < 0.95 * whole and meta["steps"][0] == 0 and meta["steps"][-1] == STEPS[-1]
     with refused("viewer.megabytes"):
         page(scene, megabytes=0.01)
-    assert len(page(scene, particles=100)) < whole
+    logged.clear()
+    assert len(page(scene, particles=300, log=logged.append)) < whole
+    assert logged[0] == "Truth: 300 of 900 particles (limit: viewer.particles = 300)" and len(logged) == 3
+    logged.clear()
+    page(scene, log=logged.append)
+    assert not logged
 
 
 def test_names_are_escaped(scene):

@@ -34,8 +34,13 @@ def picture(page, selector="canvas"):
 
 
 def first_picture(page):
-    """The picture of a file's page that is ready."""
+    """The picture of a file's page that is ready; it starts to play, and is paused at the start."""
     page.wait_for_selector("body[data-state=ready]")
+    page.wait_for_selector("body[data-frame='1']")
+    assert page.inner_text("#play") == "Pause"
+    page.evaluate("document.getElementById('time').value = 0")
+    page.dispatch_event("#time", "input")
+    assert page.inner_text("#play") == "Play"
     first = picture(page)
     assert differ(first, np.full_like(first, 255)) > 0.02, "something is drawn"
     return first
@@ -56,11 +61,13 @@ def differ(a, b):
 
 
 def test_the_file_opens_without_a_server_plays_and_follows_its_controls(folder, tmp_path):
-    write_page(tmp_path / "viewer.html", load_scene(find_scene(folder)[1]))
+    limits = []
+    write_page(tmp_path / "viewer.html", load_scene(find_scene(folder)[1]), particles=500, log=limits.append)
     with opened((tmp_path / "viewer.html").as_uri()) as (page, complaints):
         page.wait_for_selector("body[data-state=ready]")
         page.select_option("#right", "")  # one motion: the truth alone
         first = first_picture(page)
+        assert limits and page.inner_text("#message") == "\n".join(limits)
 
         def at(frame):
             page.evaluate(

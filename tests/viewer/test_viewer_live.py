@@ -121,6 +121,36 @@ def test_an_error_of_a_law_does_not_end_the_thread(live):
     assert reached(simulation, lambda s: s.time > 0.02).trouble is None
 
 
+def test_an_error_of_a_command_does_not_end_the_thread(live):
+    simulation = live(paused=True)
+    simulation.set_weight("heavy")
+    assert "could not convert" in simulation.do().notice
+    for place in (["a"], (0.5, 0.5), (float("nan"), 0.5, 0.5)):
+        simulation.hold(place)
+        assert simulation.do().notice and simulation._hand is None
+    simulation.run(True)
+    assert reached(simulation, lambda s: s.time > 0).trouble is None
+
+
+def test_the_message_of_a_divergence_names_body_and_law(live):
+    simulation = live(height=0.2)
+    simulation.add(start(), exploding(), DT)
+    trouble = reached(simulation, lambda s: s.trouble).trouble
+    assert "Body 2" in trouble and "'exploding'" in trouble and "speed" in trouble
+
+
+def test_limits_of_speed_and_height_are_announced(live):
+    simulation = live(paused=True)
+    simulation.launch((0.0, 2.0, 0.0))
+    assert simulation.do().notice is None
+    simulation.launch((0.0, 2.0 * MAX_SPEED, 0.0))
+    assert f"limited to {MAX_SPEED:g} m/s" in simulation.do().notice
+    simulation.drop(0.4)
+    assert simulation.do().notice is None
+    simulation.drop(0.9)
+    assert "by the ceiling" in simulation.do().notice
+
+
 def test_reset_restores_the_start_bit_by_bit(live):
     simulation = live()
     reached(simulation, lambda s: s.time > 0.1)

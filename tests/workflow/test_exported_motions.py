@@ -8,13 +8,14 @@ import imageio.v2 as imageio
 import numpy as np
 import pytest
 import trimesh
-from PIL import Image
+from PIL import Image, ImageSequence
 from plyfile import PlyData
 
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.splats import load_splat
 from tests.support.blends import read_blend
-from tests.support.full_run import EXPORTED, USD
+from tests.support.full_run import EXPORTED, SPRINGS, USD
+from tests.support.project import SCENE
 
 MARGIN = 0.05
 """Gaussians and surface lie at most this far from the box of the particles [m]; these are about 0.02 m apart."""
@@ -127,6 +128,15 @@ def test_films(moved):
     assert not seen[:, [0, -1]].any() and not seen[:, :, [0, -1]].any(), "and none cut at the border"
     assert seen.any(axis=0).any(axis=0).mean() > 0.5 or seen.any(axis=0).any(axis=1).mean() > 0.5
     assert abs(film[-1] - film[0]).max() > 100
+
+
+def test_a_film_in_slow_motion_shows_the_same_frames_longer(full):
+    durations = []
+    for name in ("motion.gif", "motion_slow4.gif"):
+        with Image.open(full.root / f"{SCENE}/{SPRINGS}/export" / name) as film:
+            durations.append([frame.info["duration"] for frame in ImageSequence.Iterator(film)])
+    normal, slow = durations
+    assert len(slow) == len(normal) and sum(slow) == pytest.approx(4 * sum(normal), abs=40)
 
 
 def test_blend(moved):

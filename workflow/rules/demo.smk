@@ -8,9 +8,14 @@ rule film:
         transforms=of_data("dynamic/transforms.json"),
         rollouts=expand(f"{RESULTS}/{{{{scene}}}}/{{method}}/rollout.h5", method=SETTINGS.demo.methods),
     output:
-        mp4=f"{RESULTS}/{{scene}}/film.mp4",
-        gif=f"{RESULTS}/{{scene}}/film.gif",
+        mp4=f"{RESULTS}/{{scene}}/film{{slow}}.mp4",
+        gif=f"{RESULTS}/{{scene}}/film{{slow}}.gif",
+    log:
+        f"{RESULTS}/logs/{{scene}}/film{{slow}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/{{scene}}/film{{slow}}.tsv"
     wildcard_constraints:
+        slow=SLOW,
         scene=TRUE_SCENE,
     resources:
         gpu=GPU,
@@ -19,7 +24,7 @@ rule film:
         titles=film_titles,
         motions=film_motions,
         view=SETTINGS.evaluation.video_view,
-        frame_rate=SETTINGS.evaluation.frame_rate,
+        frame_rate=film_rate,
         magnify=SETTINGS.demo.magnify,
         device=SETTINGS.device,
     script:

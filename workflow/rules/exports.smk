@@ -76,14 +76,19 @@ rule export_film:
         **MOVED,
         kernels=kernels("rendering"),
     output:
-        film=f"{EXPORT}/motion.mp4",
-        gif=f"{EXPORT}/motion.gif",
+        film=f"{EXPORT}/motion{{slow}}.mp4",
+        gif=f"{EXPORT}/motion{{slow}}.gif",
+    log:
+        f"{RESULTS}/logs/{{scene}}/{{method}}/export_film{{slow}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/{{scene}}/{{method}}/export_film{{slow}}.tsv"
     wildcard_constraints:
+        slow=SLOW,
         scene=SCENE_OR_EXPERIMENT,
     params:
         particle_source=of_bodies(shared_particle_source),
         gaussian_motion=gaussian_motion,
         size=SETTINGS.exports.size,
-        frame_rate=SETTINGS.evaluation.frame_rate,
+        frame_rate=film_rate,
     script:
         "../scripts/export_film.py"

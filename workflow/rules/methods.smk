@@ -226,6 +226,16 @@ def film_titles(wildcards):
     return [demo.titles.get(method) or cases.title(SETTINGS, method) for method in demo.methods]
 
 
+SLOW = "|_slow([2-9]|1[0-6])"
+"""Suffix of films in slow motion, for example `film_slow4.mp4` at a quarter of the speed."""
+
+
+def film_rate(wildcards):
+    """Frames per second of a film."""
+    rate, slower = SETTINGS.evaluation.frame_rate, wildcards.slow.removeprefix("_slow")
+    return rate / int(slower) if slower else rate
+
+
 @checked
 def film_motions(wildcards):
     """How Gaussians follow their particles in each method of a film."""

@@ -9,7 +9,7 @@ from workflow.stage import run_script
 def main(inputs, output, params, run) -> None:
     settings = params.viewer
     scene = load_scene(SceneFiles.of_plain(params.files), side=settings["image_side"])
-    size = write_page(output.page, scene, settings["particles"], settings["megabytes"])
+    size = write_page(output.page, scene, settings["particles"], settings["megabytes"], run.log)
     titles = ", ".join(motion.title for motion in scene.motions)
     run.log(f"{titles}: {len(scene.steps)} frames, {size / 1e6:.1f} MB")
 
