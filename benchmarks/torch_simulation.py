@@ -2,13 +2,20 @@
 
 import torch
 
+from neuma_lib.sim.colliders import CONTACT_STIFFNESS, contact_radius
 from neuma_lib.sim.model import as_regions
 
 
-def step(model, bodies, x, v, F, C, mass, vol0):
-    """One step of the paper's Algorithm 2 with all 27 nodes of a particle as one axis."""
+def step(model, bodies, x, v, F, C, mass, vol0, time=0.0):
+    """One step of the paper's Algorithm 2 with all 27 nodes of a particle as one axis.
+
+    Args:
+        time: of the step [s], for moving colliders.
+    """
     n, dx, dt = model.nodes, model.dx, model.dt
     tau = evaluate(bodies, "elasticity", F)
+    for collider in model.obstacles:
+        v = touched(collider, x, v, contact_radius(vol0), dt, time)
     cells = x / dx - model.first_node
     base = (cells.detach() - 0.5).int()
     f = cells - base
@@ -37,6 +44,20 @@ def step(model, bodies, x, v, F, C, mass, vol0):
         x = x.clamp(*model.stencil_range)
     F = evaluate(bodies, "plasticity", F + dt * C @ F)
     return x, v, F, C
+
+
+def touched(collider, x, v, radius, dt, time):
+    """Velocities after contact with a collider, see `Collider`."""
+    distance, n = collider.surface(x, time)
+    u, gap = collider.velocity_at(x, time), distance - radius
+    impulse = -CONTACT_STIFFNESS * gap / dt - collider.damping * (n * (v - u)).sum(1)
+    after = v + impulse[:, None] * n
+    slip = after - u
+    slip = slip - (n * slip).sum(1, keepdim=True) * n
+    sticks = slip.norm(dim=1) <= collider.friction * impulse
+    share = (min(collider.friction, 1e12) * impulse / slip.norm(dim=1).clamp(min=1e-300))[:, None]
+    after = torch.where(sticks[:, None], after - slip, after - share * slip)
+    return torch.where(((gap < 0) & (impulse > 0))[:, None], after, v)
 
 
 def walls(model, grid_v):
@@ -78,6 +99,6 @@ def rollout(model, law, state, frames, total=False):
         if n in frames:
             seen.append((*now, *F_total))
         if n < frames[-1]:
-            now = step(model, bodies, *now, state.mass, state.vol0)
+            now = step(model, bodies, *now, state.mass, state.vol0, n * model.dt)
             F_total = tuple(F + model.dt * now[3] @ F for F in F_total)
     return tuple(torch.stack(values) for values in zip(*seen, strict=True))

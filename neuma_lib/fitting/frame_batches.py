@@ -28,9 +28,13 @@ def spread_frames(count: int, limit: int) -> list[int]:
     return np.unique(np.linspace(0, count - 1, min(count, limit)).round().astype(int)).tolist()
 
 
-def first_contact(model: MPM, x: Tensor) -> int:
-    """Index of the first frame of positions x (T, N, 3) [m] with a particle in contact with a wall, T if none."""
-    touching = contact_clearance(model, x) <= 0
+def first_contact(model: MPM, x: Tensor, vol0: Tensor, steps: Sequence[int] = (0,)) -> int:
+    """Index of the first frame of positions x (T, N, 3) [m] with a particle in contact, T if none.
+
+    Args:
+        vol0, steps: as for `contact_clearance`.
+    """
+    touching = contact_clearance(model, x, vol0, steps) <= 0
     return int(touching.int().argmax()) if bool(touching.any()) else len(x)
 
 

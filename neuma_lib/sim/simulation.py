@@ -78,6 +78,8 @@ class Simulation:
         x = state.x
         scatter = scatter or scatter_for(x.device, x.dtype)
         size = WorkspaceSize(model, len(x), x.dtype, x.device, total=total, copies=copies, scatter=scatter)
+        if any(collider.moves for collider in model.colliders):
+            size = size._replace(n_poses=steps + 1)
         if plan:
             size = size._replace(
                 n_states=plan.segment + 1,
@@ -86,8 +88,7 @@ class Simulation:
                 differentiable=True,
             )
         self.workspace = pooled_workspace(size, user=self)
-        self.workspace.mass.copy_(state.mass.detach())
-        self.workspace.vol0.copy_(state.vol0.detach())
+        self.workspace.load_particles(state.mass.detach(), state.vol0.detach())
         self._law_cache_bytes = plan.law_cache_bytes if plan else 0
         self._cached: set[tuple] = set()  # evaluations of laws with valid caches
         self._segment_in_memory = 0
@@ -127,6 +128,7 @@ class Simulation:
             for checkpoint, state in zip(ws.checkpoints, states, strict=True):
                 if len(checkpoint):
                     checkpoint[index].copy_(state[0])
+            ws.load_poses(self.first + first, steps)
             if passive is None:
                 self._launch(("forward", steps), lambda steps=steps: self._advance(steps, weights))
             else:
@@ -165,6 +167,7 @@ class Simulation:
         for total in (*totals, *grad_weights):
             total.zero_()
         for index, (first, steps) in reversed(list(enumerate(self._segments(frames)))):
+            ws.load_poses(self.first + first, steps)
             if index != self._segment_in_memory:
                 for checkpoint, state in zip(ws.checkpoints, ws.states, strict=True):
                     state[0].copy_(checkpoint[index])
