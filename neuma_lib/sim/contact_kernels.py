@@ -71,7 +71,6 @@ def contact_functions(dtype: torch.dtype) -> SimpleNamespace:
     """
     real = {torch.float32: wp.float32, torch.float64: wp.float64}[dtype]
     vec3 = wp.types.vector(length=3, dtype=real)
-    vec4 = wp.types.vector(length=4, dtype=real)
     Obstacle = obstacle_type(dtype)
 
     # One function, because Warp 1.19 leaves out the adjoint of a nested one that a forward function uses too.
