@@ -75,7 +75,8 @@ def _parser() -> argparse.ArgumentParser:
         _check,
         "check: check settings without running anything",
         "Checks keys and values, laws and their constants, shapes, start positions and velocities, time steps, "
-        "captures, and the GPU, in seconds. Prints each problem on a line and exits with status 1 if there is one.",
+        "captures, and the GPU, in seconds. Prints each problem on a line and exits with status 1 if there is one. "
+        "Also notes results that were made with other versions of Python, torch, warp, numpy, bpy or pycolmap.",
     )
     files = f"{CONFIGFILE}; or a capture.yaml. None: config/config.yaml alone"
     check.add_argument("files", nargs="*", metavar="FILE", help=files)
@@ -206,8 +207,8 @@ def _new_capture(options: argparse.Namespace) -> None:
 
 def _check(options: argparse.Namespace) -> int:
     from neuma_lib.project import checks
-    from neuma_lib.project.capture_folder import capture_folders
     from neuma_lib.project.project import Project, project_folder
+    from neuma_lib.project.versions import changes
 
     captures = [file for file in options.files if Path(file).name == "capture.yaml"]
     files = [file for file in options.files if file not in captures]
@@ -216,13 +217,14 @@ def _check(options: argparse.Namespace) -> int:
     if files or not captures:
         root = project_folder(".")
         try:
-            settings, _ = Project.find(root, files)
+            settings, _ = Project.find(root, files, lambda error: problems.extend(checks.lines(error)))
         except InputError as error:
             problems += checks.lines(error)
         else:
-            problems += checks.problems(settings)
-            problems += checks.capture_problems(capture_folders(root / settings.captures.root))
+            problems += checks.problems(settings) + checks.local_problems(settings)
             text = checks.summary(settings, ["config/config.yaml", *files])
+            for change in changes(root / settings.results_root):
+                print(f"note: {change}")
     print("\n".join(dict.fromkeys(problems)) or text)
     return 1 if problems else 0
 

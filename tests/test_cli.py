@@ -64,6 +64,12 @@ def test_a_new_capture_is_valid_and_becomes_a_scene(project, capsys, monkeypatch
     capsys.readouterr()
     assert main(["check"]) == 1
     assert "board.square" in capsys.readouterr().out
+    (project / "captures/mug/capture.yaml").write_text("board: {square: 0.03}\nprior: jely\n")
+    assert main(["check"]) == 1
+    assert "scenes.mug.prior: no prior 'jely'" in capsys.readouterr().out
+    (project / "captures/mug").rename(project / "captures/figures")
+    assert main(["check"]) == 1
+    assert "captures/figures: this name is reserved" in capsys.readouterr().out
 
 
 @core
@@ -76,6 +82,7 @@ def test_a_new_capture_is_valid_and_becomes_a_scene(project, capsys, monkeypatch
         ({"center": [0.9, 0.5]}, "scenes.JellyDuck.center"),
         ({"velocity": [0, -60, 0]}, "scenes.JellyDuck.velocity"),
         ({"spin": [0, 300, 0]}, "scenes.JellyDuck.velocity"),
+        ({"velocity": [0, 0, 0], "steps": 100}, "scenes.JellyDuck.steps"),
         ({"law": {"elasticity": {"E": -1}}}, "scenes.JellyDuck.law.elasticity.E"),
         ({"law": {"elasticity": {"name": "jelly"}}}, "scenes.JellyDuck.law.elasticity.name"),
         ({"law": {"plasticity": {"name": "von_mises"}}}, "scenes.JellyDuck.law.plasticity.yield_stress"),
@@ -87,6 +94,47 @@ def test_check_names_each_problem(project, capsys, scene, where):
     assert main(["check", overlay(project, scenes={"JellyDuck": scene})]) == 1
     out = capsys.readouterr().out.splitlines()
     assert any(line.startswith(f"{where}:") for line in out), out
+
+
+@core
+@pytest.mark.parametrize(
+    ("settings", "where"),
+    [
+        ({"training": {"views": [7]}}, "training.views"),
+        ({"evaluation": {"views": [-1]}}, "evaluation.views"),
+        ({"scenes": {"JellyDuck": {"training": {"views": [7]}}}}, "scenes.JellyDuck.training.views"),
+        ({"scenes": {"S": {"splat": "a.ply", "velocity": [0, -90, 0]}}}, "scenes.S.velocity"),
+        (
+            {
+                "scenes": {"S": {"splat": "a.ply"}},
+                "experiments": {"x": {"title": "x", "steps": 9, "bodies": [{"scene": "S", "shape": "ball"}]}},
+            },
+            "experiments.x.bodies.0",
+        ),
+        ({"results_root": ""}, "results_root"),
+    ],
+)
+def test_check_names_problems_of_other_settings(project, capsys, settings, where):
+    assert main(["check", overlay(project, **settings)]) == 1
+    out = capsys.readouterr().out.splitlines()
+    assert any(line.startswith(f"{where}:") for line in out), out
+
+
+@core
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("# nothing\n", "the file is empty"),
+        ("scenes: [\n", "line 2, column 1"),
+        ("scenes: {ClayCat: {}, ClayCat: {}}\n", "line 1, column 23: the key 'ClayCat' is in line 1 already"),
+        ("- 1\n", "expected lines 'key: value'"),
+    ],
+)
+def test_check_names_the_file_that_is_broken(project, capsys, text, problem):
+    (project / "mine.yaml").write_text(text)
+    assert main(["check", "mine.yaml"]) == 1
+    (line,) = capsys.readouterr().out.splitlines()
+    assert line.startswith("mine.yaml: ") and problem in line
 
 
 @core

@@ -14,8 +14,9 @@ import logging
 import os
 import resource
 import sys
+import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TextIO
@@ -24,6 +25,8 @@ from tqdm import tqdm
 
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.extensions import load_laws
+from neuma_lib.io.files import unwritable
+from neuma_lib.project import versions
 from workflow.manager import end_with_snakemake
 
 PLAIN_INTERVAL = 15.0  # seconds between plain lines
@@ -33,7 +36,7 @@ WIDTH, ROWS = 80, 24  # of a terminal of unknown size
 LOG_FORMAT = "[%(asctime)s] %(message)s"
 
 _LOGGER = logging.getLogger("neuma_lib.stage")
-_SECONDS_LOGGER = logging.getLogger("neuma_lib.seconds")  # for the log alone
+_LOG_LOGGER = logging.getLogger("neuma_lib.log")  # for the log alone
 _SECONDS = "core seconds: {:.2f} to start, {:.2f} of work"  # read by neuma_lib.project.timings
 
 
@@ -54,7 +57,7 @@ def stage(name: str, log: str | Path | None = None, stream: TextIO | None = None
     handlers: list[logging.Handler] = [_Terminal(run)]
     if log:
         Path(log).parent.mkdir(parents=True, exist_ok=True)
-        handlers.append(logging.FileHandler(log, "w"))
+        handlers.append(_Log(log, "w"))
         handlers[-1].setFormatter(logging.Formatter(LOG_FORMAT))
     for handler in handlers:
         root.addHandler(handler)
@@ -78,9 +81,10 @@ def run_script(main: Callable, snakemake) -> None:
     name = " ".join(filter(None, [snakemake.rule, "/".join(snakemake.wildcards)]))
     started = _core_seconds()  # of the interpreter and all imports
     with stage(name, snakemake.log[0]) as run:
+        _LOG_LOGGER.info(versions.line())
         load_laws(snakemake.config.get("extensions") or ())
         main(snakemake.input, snakemake.output, snakemake.params, run)
-        _SECONDS_LOGGER.info(_SECONDS.format(started, _core_seconds() - started))
+        _LOG_LOGGER.info(_SECONDS.format(started, _core_seconds() - started))
 
 
 def _core_seconds() -> float:
@@ -123,6 +127,9 @@ class Stage:
                 nrows=ROWS,
                 bar_format=("{desc}  {bar:24}  " if moving else "") + STATE,
             )
+            # tqdm takes the clock of the system, which may jump.
+            self._bar._time = time.monotonic
+            self._bar.start_t = self._bar.last_print_t = time.monotonic()
         if loss is not None:
             self._bar.set_postfix_str(f"loss {loss:.4g}", refresh=False)
         self._bar.total = total  # work may turn out to be more
@@ -134,6 +141,17 @@ class Stage:
             self._bar.close()
         if self._terminal is not None:
             self._terminal.close()
+
+
+class _Log(logging.FileHandler):
+    """A file of messages; those that do not fit on a full disk are lost without an error."""
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        pass
+
+    def close(self) -> None:
+        with suppress(OSError):
+            super().close()
 
 
 class _Terminal(logging.Handler):
@@ -163,6 +181,8 @@ def _locked_terminal(stream: TextIO) -> TextIO | None:
 def _plain(error: BaseException) -> str:
     if isinstance(error, InputError | NonFiniteError):
         return str(error)
+    if full := unwritable(error):
+        return str(full)
     if isinstance(error, KeyboardInterrupt):
         return "interrupted; run the same command again to go on"
     return f"{type(error).__name__}: {error}"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -15,11 +15,13 @@ class AppearanceConfig(Section):
     kind: Literal["solid", "grains", "liquid"] = Field(
         "solid", description="textured mesh, grains, or the surface of a liquid"
     )
-    colors: dict[str, str] = Field(
+    colors: dict[str, Annotated[str, Field(pattern="^#[0-9a-fA-F]{6}$")]] = Field(
         description="part of the shape -> sRGB colour '#rrggbb'; 'body' for all other parts"
     )
     accent: str = Field(
-        "", description="colour of the patches on the body; on other parts, and if empty, a darker shade"
+        "",
+        pattern="^(#[0-9a-fA-F]{6})?$",
+        description="colour of the patches on the body; on other parts, and if empty, a darker shade",
     )
     contrast: float = Field(0.5, ge=0, le=1, description="strength of the patches")
     scale: float = internal(0.045, "size of the patches [m]", gt=0)

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from neuma_lib.config.base import Section, internal
+from neuma_lib.config.base import Section, Seed, internal
 from neuma_lib.config.board import BoardConfig
 
 
@@ -111,7 +111,7 @@ class CaptureConfig(Section):
     longest: int = internal(
         1000, "maximum length of the longer side of the undistorted pictures [px]", ge=64, le=8192
     )
-    seed: int = internal(0, "seed of the search for camera poses", ge=0)
+    seed: Seed = internal(0, "seed of the search for camera poses")
     prior: str = Field(
         "jelly", description="prior of the law: a name in priors.laws, or a path as for a scene"
     )

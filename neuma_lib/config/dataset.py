@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field, model_validator
 
-from neuma_lib.config.base import Section
+from neuma_lib.config.base import Section, Seed
 from neuma_lib.config.blender import BlenderConfig, ImagesConfig
 
 
@@ -30,7 +30,7 @@ class DatasetConfig(Section):
         gt=0,
         description="time step of the ground truth [s], an integer fraction of the scene's; null: equal",
     )
-    seed: int = Field(
+    seed: Seed = Field(
         1000,
         description="seed of the particles of the ground truth; the next two sample its tracers. It must differ from "
         "the seeds of the reconstruction",

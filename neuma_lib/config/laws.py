@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from pydantic import ConfigDict, Field
 
-from neuma_lib.config.base import Section
+from neuma_lib.config.base import Constant, Section
 
 
 class LawPart(Section):
     """One of the two parts of a law: its name, and its constants in SI units by name."""
 
     model_config = ConfigDict(extra="allow")
-    __pydantic_extra__: dict[str, float]
+    __pydantic_extra__: dict[str, Constant]
 
     name: str = Field(description="name of the elastic law or the return map")
 

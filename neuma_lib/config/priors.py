@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from neuma_lib.config.base import Section, internal
+from neuma_lib.config.base import Section, Seed, internal
 from neuma_lib.config.laws import LawConfig
 
 
@@ -35,5 +35,5 @@ class PriorsConfig(Section):
     """Pre-trained neural constitutive laws."""
 
     laws: dict[str, LawConfig] = Field({}, description="analytic law behind each prior, by name")
-    seed: int = internal(0, "seed of the data and the initial weights")
+    seed: Seed = internal(0, "seed of the data and the initial weights")
     regression: RegressionConfig = Field(RegressionConfig(), description="the regression")

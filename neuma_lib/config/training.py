@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from neuma_lib.config.base import Compared, internal
+from neuma_lib.config.base import Compared, Seed, internal
 from neuma_lib.config.motion import MotionOptions
 
 
@@ -25,7 +25,7 @@ class TrainingConfig(MotionOptions):
         16, ge=1, description="rank of the adaptor; null: train the base weights (w/o dM)"
     )
     alpha: float = internal(16.0, "the scale of the adaptor is alpha / rank", gt=0)
-    seed: int = Field(0, description="seed of the initial weights of the adaptor")
+    seed: Seed = Field(0, description="seed of the initial weights of the adaptor")
     lr_scale: float = Field(1.0, gt=0, description="factor of both learning rates")
     covariance_gradient: bool = internal(True, "propagate image gradients to F through the covariances")
     iterations: int = Field(50, ge=1, description="optimiser steps, each with a full rollout")

@@ -7,13 +7,25 @@ a scene or experiment has its seeds in the name, except 0. Files that several re
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Iterable, Mapping
 
 from neuma_lib.config.validation import hint
 from neuma_lib.errors import InputError
 
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
+"""Names of scenes, methods, captures, takes and cameras. Folders of results are named after them."""
+RESERVED = ("benchmarks", "experiments", "figures", "kernels", "logs", "none", "priors", "weights")
+"""Folders of results and data that belong to no scene or method, and what patterns contain in place of no name."""
 SEEDS = ("prior", "gaussians", "particles", "adaptor")
 """What the seeds of a replicate change, in order."""
+
+
+def name_problem(name: str) -> str:
+    """Why a name cannot be that of a scene, a method or a capture; empty if it can."""
+    if not NAME.fullmatch(name) or len(name) > 80:
+        return "a name must consist of at most 80 letters, digits, - and _, and not begin with - or _"
+    return "this name is reserved for a folder of other files" if name in RESERVED else ""
 
 
 def split_variant(

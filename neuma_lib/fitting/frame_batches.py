@@ -6,14 +6,16 @@ the gradients with respect to the states batch by batch, and the backward pass o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import pairwise
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from neuma_lib.errors import InputError
 from neuma_lib.sim.model import MPM, contact_clearance
+from neuma_lib.sim.state import State
 
 
 def frame_batches(count: int, size: int) -> Iterator[slice]:
@@ -36,6 +38,48 @@ def first_contact(model: MPM, x: Tensor, vol0: Tensor, steps: Sequence[int] = (0
     """
     touching = contact_clearance(model, x, vol0, steps) <= 0
     return int(touching.int().argmax()) if bool(touching.any()) else len(x)
+
+
+def check_contact(model: MPM, videos: Iterable[tuple[State, Sequence[int]]]) -> None:
+    """Check that a body touches a wall within a video, since its free flight does not depend on the material.
+
+    The motion before contact is known in closed form: a parabola and, up to the small stretch by a spin, a rotation.
+
+    Args:
+        videos: initial state of the body and steps of the frames of each video.
+
+    Raises:
+        InputError: no body touches a wall before the last frame of its video.
+    """
+    ends = []
+    for start, frames in videos:
+        ends.append((start, last := frames[-1]))
+        if any(_touches(model, start, n) for n in (last, *frames)):
+            return
+    start, last = max(ends, key=lambda end: end[1])
+    later = range(last, 20 * last + 1, max(1, last // 20))
+    contact = next((n for n in later if _touches(model, start, n)), None)
+    expected = "" if contact is None else f", expected at about {contact * model.dt:.2g} s,"
+    raise InputError(
+        "frames",
+        f"the body touches nothing until the last frame, at {last * model.dt:.3g} s. The frame of first contact"
+        f"{expected} is missing, and free flight does not depend on the material",
+        "Use a longer video, or launch the body faster or closer to the floor",
+    )
+
+
+def _touches(model: MPM, start: State, n: int) -> bool:
+    """Whether the body of an initial state would have a particle in the contact zone of a wall at step n."""
+    mass, gravity = start.mass / start.mass.sum(), torch.tensor(model.gravity).to(start.x)
+    centre, velocity = mass @ start.x, mass @ start.v.expand_as(start.x)
+    turn = torch.linalg.matrix_exp(n * model.dt * (start.C[0] - start.C[0].mT) / 2)
+    x = (
+        centre
+        + (start.x - centre) @ turn.mT
+        + n * model.dt * velocity
+        + model.dt**2 * n * (n + 1) / 2 * gravity
+    )
+    return float(contact_clearance(model, x)) <= 0
 
 
 def held_out_frames(count: int, share: float, blocks: int = 1, contact: int = 0) -> list[int]:

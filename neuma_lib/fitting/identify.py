@@ -32,6 +32,7 @@ from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.fitting.families import Family
 from neuma_lib.fitting.family_run import FamilyRun
+from neuma_lib.fitting.frame_batches import check_contact
 from neuma_lib.fitting.identified import FamilyFit, Identified
 from neuma_lib.fitting.video_residuals import VideoResiduals
 from neuma_lib.mechanics.combinations import Values
@@ -68,7 +69,7 @@ def identify(
         log: receives a line for every family.
 
     Raises:
-        InputError: fewer than four frames, no family, or one with unknown parts.
+        InputError: fewer than four frames, none of them after a contact, no family, or one with unknown parts.
         NonFiniteError: every family diverges from every start.
     """
     given = [(motion, body, observation), *other_videos]
@@ -80,6 +81,7 @@ def identify(
         raise InputError(
             "identify.families", "it has no candidates", "Add at least one elasticity with E and nu"
         )
+    check_contact(model, ((one.of_body(each), joint_frames(several(video))) for one, each, video in given))
     families = [Family(name, law.plain()) for name, law in settings.families.items()]
     families.sort(key=lambda family: len(family.constants))  # simpler families provide starts of the others
     resampled = refined or [()] * len(given)

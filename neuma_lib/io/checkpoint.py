@@ -6,6 +6,7 @@ if the fingerprint differs, and is removed when the stage has written its result
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -37,8 +38,10 @@ class Checkpoint:
         if torch.cuda.is_available():
             generators["cuda"] = torch.cuda.get_rng_state_all()
         content = {"fingerprint": self.fingerprint, "generators": generators, "state": dict(state)}
+        buffer = io.BytesIO()  # on a full disk torch.save does not name the reason
+        torch.save(content, buffer)
         with atomic(self.path) as partial:
-            torch.save(content, partial)
+            partial.write_bytes(buffer.getbuffer())
 
     def load(self) -> dict[str, Any] | None:
         """The saved state, or None if there is none. Restores the random generators.

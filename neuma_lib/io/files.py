@@ -9,12 +9,14 @@ Lengths are metres, times seconds, masses kilograms; arrays are numpy.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
+import re
 import zipfile
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -26,15 +28,45 @@ def atomic(path: str | Path) -> Iterator[Path]:
     """A temporary path in the folder of ``path``, renamed to ``path`` when the block ends without an error.
 
     A killed process leaves at most one file ``.partial-<name>``, which the next run overwrites.
+
+    Raises:
+        InputError: the disk is full or the folder is read-only.
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".partial-{path.name}")
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         yield partial
         os.replace(partial, path)
+    except (OSError, RuntimeError) as error:
+        if full := unwritable(error, path):
+            raise full from None
+        raise
     finally:
-        partial.unlink(missing_ok=True)
+        with suppress(OSError):  # of a read-only file system, even if there is no such file
+            partial.unlink(missing_ok=True)
+
+
+_FULL = "Free disk space and run the same command again"
+_READ_ONLY = "Make the folder writable, or choose another one (setting results_root or data_root)"
+_REMEDIES = {
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), _FULL),
+    **dict.fromkeys((errno.EROFS, errno.EACCES, errno.EPERM), _READ_ONLY),
+}
+
+
+def unwritable(error: BaseException, path: str | Path | None = None) -> InputError | None:
+    """The error of a full disk or of a read-only folder as an `InputError`; None for other errors.
+
+    Args:
+        path: the file that was written, if the error does not name it.
+    """
+    found = re.search(r"errno = (\d+)", str(error))  # HDF5 raises a RuntimeError
+    number = int(found[1]) if found else getattr(error, "errno", None)
+    if number not in _REMEDIES:
+        return None
+    where = path or getattr(error, "filename", None) or "output"
+    return InputError(where, f"cannot be written: {os.strerror(number)}", _REMEDIES[number])
 
 
 def write_text(path: str | Path, text: str) -> None:

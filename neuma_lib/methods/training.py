@@ -10,6 +10,7 @@ import torch
 
 from neuma_lib.config.training import TrainingConfig
 from neuma_lib.coupling.reconstruction import Reconstruction
+from neuma_lib.fitting.frame_batches import check_contact
 from neuma_lib.fitting.material import ParticleLoss, PixelLoss
 from neuma_lib.io.files import listed, write_json
 from neuma_lib.io.hdf5 import read_arrays
@@ -58,6 +59,8 @@ class Training:
                 pixel_loss(body, self._videos(file), settings)
                 for body, file in zip(bodies, listed(inputs["transforms"]), strict=True)
             ]
+        frames = [loss.frames for loss in self.losses]
+        check_contact(MPM(**problem.simulation), zip(self.starts, frames, strict=True))
         files = {
             f"{name} {k}": file for name, value in inputs.items() for k, file in enumerate(listed(value))
         }

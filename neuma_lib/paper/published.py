@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
-
+from neuma_lib.io.yaml_files import load_yaml
 from neuma_lib.paper.claims import Bound, Claim, Closer
 
 OUTSIDE = "outside_band"
@@ -41,7 +40,7 @@ def _claim(entry: Mapping[str, Any]) -> Claim:
     return (Bound if "limit" in values else Closer)(**values)
 
 
-_CONTENT = yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text(encoding="utf-8"))
+_CONTENT = load_yaml(Path(__file__).with_suffix(".yaml"))
 
 PAPER = {
     name: PaperTable(**{**entry, "claims": tuple(map(_claim, entry.get("claims", ())))})

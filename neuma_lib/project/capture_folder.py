@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-import yaml
-
 from neuma_lib.config.capture import CaptureConfig
 from neuma_lib.config.validation import hint, validate, with_advanced
+from neuma_lib.config.variants import NAME
 from neuma_lib.errors import InputError
-from neuma_lib.io.files import existing, one_line, reading
+from neuma_lib.io.files import one_line
+from neuma_lib.io.yaml_files import load_yaml
 
-NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
-"""Valid names of captures, takes and cameras. Results are named after them."""
 PHOTOGRAPHS = "photographs"
 """Group of the photographs. Other groups are named after cameras."""
 PICTURES = (".jpg", ".jpeg", ".png", ".webp")
@@ -87,15 +84,14 @@ def _no_videos(folder: Path) -> InputError:
 
 
 def capture_folders(root: str | Path) -> list[Path]:
-    """The folders of all captures below a folder, sorted. Empty if it does not exist."""
-    return sorted(p for p in Path(root).iterdir() if p.is_dir()) if Path(root).is_dir() else []
+    """The folders of all captures below a folder, sorted, without hidden ones. Empty if it does not exist."""
+    folders = Path(root).iterdir() if Path(root).is_dir() else ()
+    return sorted(p for p in folders if p.is_dir() and not p.name.startswith("."))
 
 
 def read_settings(path: str | Path) -> CaptureConfig:
     """Settings of a capture.yaml. Raises InputError: names the file and each invalid, missing or unknown key."""
-    content = existing(path, "Create it as in the example of docs/capture.md").read_bytes()
-    with reading(path, "YAML"):
-        raw = yaml.safe_load(content)
+    raw = load_yaml(path, "Create it as in the example of docs/capture.md")
     try:
         return validate(
             CaptureConfig, with_advanced(CaptureConfig, raw) if isinstance(raw, dict) else raw or {}

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from neuma_lib.config.capture import ReleasedConfig
 from neuma_lib.config.validation import hint
+from neuma_lib.config.variants import name_problem
 from neuma_lib.errors import InputError
-from neuma_lib.project.capture_folder import NAME, Capture, capture_folders, read_capture
+from neuma_lib.io.files import one_line
+from neuma_lib.project.capture_folder import Capture, capture_folders, read_capture
 from neuma_lib.project.released_captures import released_captures
 
 
@@ -17,26 +20,50 @@ def captured_scenes(
     root: str | Path,
     released: Mapping[str, ReleasedConfig] | None = None,
     planned: Mapping[str, Capture] | None = None,
+    log: Callable[[InputError], None] = lambda error: None,
 ) -> dict[str, dict[str, Any]]:
     """Settings of the scenes of all captures in a folder, of released and of planned captures, by name.
 
     A capture ``mug`` has a scene ``mug`` for its photographs and a scene ``mug_<take>`` for each take. The law is
-    learned in the first of the `training_takes`. The others are its ``videos``. Captures that cannot be read are
-    skipped, since their own rules report the error.
+    learned in the first of the `training_takes`. The others are its ``videos``.
+
+    Args:
+        log: called for each capture, released or in the folder, that has no scenes, because it cannot be read or they
+            are those of another capture. Targets that need it are refused by its own rules.
     """
     scenes: dict[str, dict[str, Any]] = {}
-    for capture in (*(planned or {}).values(), *released_captures(released or {}).values()):
+    for capture in (planned or {}).values():
         scenes |= scenes_of(capture)
-    for folder in capture_folders(root):
-        if not NAME.fullmatch(folder.name) or folder.name in (planned or {}):
-            continue
+    readers = [partial(_released_capture, name, settings) for name, settings in (released or {}).items()]
+    folders = [folder for folder in capture_folders(root) if folder.name not in (planned or {})]
+    for read in [*readers, *(partial(checked_capture, folder) for folder in folders)]:
         try:
-            capture = read_capture(folder)
-            training_takes(capture)
-        except InputError:
-            continue
-        scenes |= scenes_of(capture)
+            capture = read()
+            own = scenes_of(capture)
+            if shared := sorted(own.keys() & scenes):
+                problem = f"another capture has a scene {shared[0]}"
+                raise InputError(capture.folder, problem, "Rename one of the two")
+        except InputError as error:
+            log(error)
+        else:
+            scenes |= own
     return scenes
+
+
+def _released_capture(name: str, settings: ReleasedConfig) -> Capture:
+    return released_captures({name: settings})[name]
+
+
+def checked_capture(folder: Path) -> Capture:
+    """A capture whose scenes can be used. Raises InputError: see `read_capture` and `training_takes`, or its name."""
+    if problem := name_problem(folder.absolute().name):
+        raise InputError(folder, problem, "Rename the folder")
+    try:
+        capture = read_capture(folder)
+    except OSError as error:
+        raise InputError(folder, one_line(error), "Make it readable, or move it elsewhere") from None
+    training_takes(capture)
+    return capture
 
 
 def scenes_of(capture: Capture) -> dict[str, dict[str, Any]]:

@@ -7,12 +7,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import yaml
-
 from neuma_lib.config.base import Section
 from neuma_lib.config.validation import hint, validate
 from neuma_lib.config.variants import SEEDS, replicate_folder, split_variant
 from neuma_lib.errors import InputError
+from neuma_lib.io.yaml_files import parse_yaml
 from neuma_lib.methods.base import Case, Method, ModelSource
 from neuma_lib.methods.registry import methods
 from neuma_lib.project import paths
@@ -133,7 +132,8 @@ def preset(settings: Config, method: str) -> tuple[PresetConfig, dict[str, Any]]
     given: dict[str, Any] = {}
     for key, value in texts.items():
         is_list = key in options and typing.get_origin(options[key].annotation) is tuple
-        given[key] = [yaml.safe_load(v) for v in value.split(",")] if is_list else yaml.safe_load(value)
+        values = [parse_yaml(text, method) for text in (value.split(",") if is_list else [value])]
+        given[key] = values if is_list else values[0]
     return settings.methods[base], given
 
 

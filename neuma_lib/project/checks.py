@@ -1,4 +1,7 @@
-"""Checks of a project's settings that run nothing and load no torch: laws, shapes, starts, time steps, the GPU."""
+"""Checks of a project's settings that run nothing and load no torch: laws, shapes, starts, time steps, views, the GPU.
+
+`neuma check` and every call of Snakemake make the same checks, before the first job.
+"""
 
 from __future__ import annotations
 
@@ -15,21 +18,32 @@ import numpy as np
 from neuma_lib.config.validation import hint
 from neuma_lib.errors import InputError
 from neuma_lib.mechanics.catalogue import COURANT_LIMIT, DEFINED_IN, check_law, longitudinal_modulus
-from neuma_lib.project.capture_folder import NAME, read_capture
-from neuma_lib.project.capture_scenes import training_takes
-from neuma_lib.project.random_scenes import LETTER, SHAPES
+from neuma_lib.project.capture_scenes import checked_capture
+from neuma_lib.project.consistency import prior_errors
+from neuma_lib.project.random_scenes import LETTER, SHAPES, flight
 from neuma_lib.project.settings import Config
 
 ROUND_OFF = 1e-6
+CONTACT_CELLS = 2.5
+"""At least the width of the zone at a wall in which a body touches it [cells]."""
 
 
 def problems(settings: Config) -> list[str]:
-    """All problems of valid settings, one line each."""
+    """Problems of valid settings that stop every command, one line each."""
     return [
         *law_problems(settings),
+        *_view_problems(settings),
         *_scene_problems(settings),
         *_experiment_problems(settings),
+    ]
+
+
+def local_problems(settings: Config) -> list[str]:
+    """Problems that stop only what needs it, one line each: a missing GPU, a video without contact, captures."""
+    return [
         *_device_problems(settings.device),
+        *_contact_problems(settings),
+        *_scene_problems(settings, own_captures=True),
     ]
 
 
@@ -38,9 +52,7 @@ def capture_problems(folders: Iterable[Path]) -> list[str]:
     problems = []
     for folder in folders:
         try:
-            if not NAME.fullmatch(folder.absolute().name):
-                raise InputError(folder, "the name is invalid", "Use letters, digits, - and _")
-            training_takes(read_capture(folder))
+            checked_capture(folder)
         except InputError as error:
             problems += lines(error)
     return problems
@@ -84,17 +96,43 @@ def _checked(where: str, spec: Mapping[str, Any]) -> tuple[dict[str, Any] | None
         return None, [str(InputError(f"{where}.{error.where}", error.problem, error.remedy))]
 
 
-def _scene_problems(settings: Config) -> Iterator[str]:
+def _scene_problems(settings: Config, own_captures: bool = False) -> Iterator[str]:
+    """Problems of the scenes of own captures, or of all others."""
     priors = settings.priors.laws
     for name, scene in settings.scenes.items():
+        if settings.is_own_capture(name) != own_captures:
+            continue
         where, world, plain = f"scenes.{name}", settings.scene_world(name), scene.plain()
+        if own_captures:
+            yield from map(str, prior_errors(settings, name))
         if scene.has_truth:
             truth = settings.scene_truth(name)
             yield from _start_problems(where, plain, scene.dt, world["grid"])
             yield from _courant_problem(f"{where}.law", plain["law"], plain["density"], truth.grid, truth.dt)
+        if scene.splat:
+            reach = plain["size"] * math.sqrt(3) / 2
+            yield from _speed_problem(where, plain, reach, scene.dt, world["grid"])
         if scene.prior in priors:
             spec, label = priors[scene.prior].plain(), f"{where}.prior = {scene.prior}"
             yield from _courant_problem(label, spec, plain["density"], world["grid"], scene.dt)
+
+
+def _view_problems(settings: Config) -> Iterator[str]:
+    """Views of videos that are rendered here, of which there are dataset.dynamic.views."""
+    rendered = {
+        name: scene
+        for name, scene in settings.scenes.items()
+        if scene.has_truth and scene.images.dynamic is None
+    }
+    sections = ("training", "identify", "velocity", "evaluation")
+    named = {f"{key}.views": getattr(settings, key).views for key in sections if rendered}
+    named |= {
+        f"scenes.{name}.training.views": scene.training.get("views") for name, scene in rendered.items()
+    }
+    count = settings.dataset.dynamic.views
+    for where, views in named.items():
+        if wrong := [view for view in views or () if not 0 <= view < count]:
+            yield f"{where}: no view {wrong[0]}. dataset.dynamic.views = {count}, which are numbered from 0"
 
 
 def _experiment_problems(settings: Config) -> Iterator[str]:
@@ -114,6 +152,9 @@ def _start_problems(where: str, body: Mapping[str, Any], dt: float, grid: int) -
     if not (shape in SHAPES or re.fullmatch(r"letter_[A-Z]", shape)):
         yield f"{where}.shape: {shape!r} is unknown{hint(shape, [*SHAPES, 'letter_A'])}"
         return
+    if missing := [key for key in ("height", "velocity", "law") if body[key] is None]:
+        yield f"{where}: the scene of a capture or splat has no {', '.join(missing)}. Give it, or choose another scene"
+        return
     proportions = SHAPES.get(shape, LETTER)
     size = body["size"] or proportions.size
     half = size * np.array(proportions.sides) / 2
@@ -126,6 +167,26 @@ def _start_problems(where: str, body: Mapping[str, Any], dt: float, grid: int) -
                 f"size = {size:g} m"
             )
     reach = float(np.linalg.norm(half + size * np.abs(proportions.mass_centre)))
+    yield from _speed_problem(where, body, reach, dt, grid)
+
+
+def _contact_problems(settings: Config) -> Iterator[str]:
+    """Scenes in whose videos not even the bounding box of the body touches a wall."""
+    for name, scene in settings.scenes.items():
+        if scene.has_truth and scene.shape in SHAPES:
+            world, seconds = settings.scene_world(name), settings.frame_steps(name)[-1] * scene.dt
+            size = scene.size or SHAPES[scene.shape].size
+            middle, turned = flight(scene.plain(), size, world["gravity"], seconds)
+            reach, zone = np.abs(turned).sum(axis=2), CONTACT_CELLS / world["grid"]
+            if (middle - reach > zone).all() and (middle + reach < 1 - zone).all():
+                yield (
+                    f"scenes.{name}.steps: the body touches nothing in the {seconds:.3g} s of the video, so that no "
+                    "method can learn its material. Use more steps, a larger velocity or a smaller height"
+                )
+
+
+def _speed_problem(where: str, body: Mapping[str, Any], reach: float, dt: float, grid: int) -> Iterator[str]:
+    """The problem of a start so fast that it crosses a cell in a step, of a body that extends to ``reach`` [m]."""
     speed = math.hypot(*body["velocity"]) + math.hypot(*body["spin"]) * reach
     if speed * dt * grid >= 1:
         yield (

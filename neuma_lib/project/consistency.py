@@ -2,25 +2,39 @@
 
 from __future__ import annotations
 
+import os
+import re
 from collections.abc import Iterator
+from functools import partial, reduce
+from pathlib import Path
 
 from neuma_lib.config.figures import FiguresConfig
 from neuma_lib.config.validation import hint, joined, validate
+from neuma_lib.config.variants import name_problem
 from neuma_lib.errors import InputError
+from neuma_lib.io.files import one_line
 from neuma_lib.methods.registry import methods
 from neuma_lib.project.cases import check_prior, law_from, section_values
 from neuma_lib.project.paths import IDENTIFIED
 from neuma_lib.project.settings import Config
 
+SOURCES = ("config", "docs", "neuma_lib", "profiles", "workflow")
+"""Folders of a project."""
+SYSTEM = ("bin", "boot", "dev", "etc", "lib", "lib64", "proc", "sbin", "sys", "usr")
+"""Folders at the root of the file system that are no place for results."""
 SAMPLED_IN_TRUTH = ("particles", "tracers", "second tracers")
 """What the seeds dataset.seed, dataset.seed + 1 and dataset.seed + 2 sample, see `neuma_lib.data.ground_truth`."""
 SHARED_BY_VIDEOS = ("law", "prior", "dt")
 """Keys that the scenes of several videos have in common."""
 
 
-def check_consistency(settings: Config) -> None:
-    """Raise an InputError that lists all problems, or all of the methods where there is no other one."""
-    for check in (_section_errors, _method_errors):
+def check_consistency(settings: Config, root: str | Path = ".") -> None:
+    """Raise an InputError that lists all problems, or all of the methods where there is no other one.
+
+    Args:
+        root: folder of the project.
+    """
+    for check in (partial(_section_errors, root=root), _method_errors):
         errors: dict[str, InputError] = {}
         for error in check(settings):
             errors.setdefault(error.where, error)  # one for each key
@@ -28,8 +42,9 @@ def check_consistency(settings: Config) -> None:
             raise joined(list(errors.values()))
 
 
-def _section_errors(settings: Config) -> Iterator[InputError]:
+def _section_errors(settings: Config, root: str | Path) -> Iterator[InputError]:
     yield from _name_errors(settings)
+    yield from _folder_errors(settings, root)
     for name in settings.scenes:
         yield from _scene_errors(settings, name)
     for name in settings.methods:
@@ -46,11 +61,13 @@ def _section_errors(settings: Config) -> Iterator[InputError]:
 
 def _name_errors(settings: Config) -> Iterator[InputError]:
     """Names are folders, in which + begins a variant, and differ from each other."""
-    named = {kind: getattr(settings, kind) for kind in ("scenes", "experiments", "methods")}
-    for kind, names in (named | {"priors.laws": settings.priors.laws}).items():
+    named = {kind: getattr(settings, kind) for kind in ("scenes", "experiments", "methods", "tables")}
+    named |= {"priors.laws": settings.priors.laws, "captures.released": settings.captures.released}
+    named |= {f"random.{kind}": getattr(settings.random, kind) for kind in ("families", "outside")}
+    for kind, names in named.items():
         for name in names:
-            if "+" in name or "/" in name:
-                yield InputError(f"{kind}.{name}", "a name must not contain + or /")
+            if problem := name_problem(name):
+                yield InputError(f"{kind}.{one_line(name)}", problem, "Choose another name")
     if IDENTIFIED in settings.priors.laws:
         where, problem = (
             f"priors.laws.{IDENTIFIED}",
@@ -61,16 +78,48 @@ def _name_errors(settings: Config) -> Iterator[InputError]:
         yield InputError(f"experiments.{name}", "a scene has this name")
 
 
+def _folder_errors(settings: Config, root: str | Path) -> Iterator[InputError]:
+    """Folders that rules write to hold nothing else."""
+    project, home = Path(root).resolve(), Path(os.path.expanduser("~"))
+    used: dict[Path, str] = {}
+    for key in ("data_root", "results_root", "kernel_cache", "captures.root"):
+        folder = reduce(getattr, key.split("."), settings)
+        if not re.fullmatch(r"[^\s~{}*?\[\]\\][^{}*?\[\]\\]{0,199}", folder) or not folder.isprintable():
+            yield InputError(
+                key, f"'{one_line(folder)}' does not name a folder", "Give one, such as results/mine"
+            )
+            continue
+        path = (project / folder).resolve()
+        first, *below = path.parts[1:3] or [""]
+        if not below or path in (home, *home.parents, project, *project.parents):
+            problem = f"{path} holds more than this project's files"
+        elif path.is_relative_to(project) and path.relative_to(project).parts[0] in SOURCES:
+            problem = f"{path} holds the project's own files"
+        elif first in SYSTEM and (first, *below) != ("dev", "shm"):
+            problem = f"{path} belongs to the system"
+        elif path in used:
+            problem = f"{path} is {used[path]}"
+        else:
+            used[path] = key
+            continue
+        yield InputError(key, problem, "Give another folder, such as results/mine")
+
+
 def _scene_errors(settings: Config, name: str) -> Iterator[InputError]:
-    scene, laws = settings.scenes[name], settings.priors.laws
-    if "/" not in scene.prior and "." not in scene.prior and scene.prior not in laws:
-        yield InputError(
-            f"scenes.{name}.prior", f"no prior '{scene.prior}' in priors.laws{hint(scene.prior, laws)}"
-        )
+    scene = settings.scenes[name]
+    if not settings.is_own_capture(name):  # otherwise it stops only what needs the capture
+        yield from prior_errors(settings, name)
     changed = {**settings.training.plain(), **scene.training}
     yield from _raised_by(validate, type(settings.training), changed, f"scenes.{name}.training")
     yield from _raised_by(settings.scene_truth, name)
     yield from _video_errors(settings, name)
+
+
+def prior_errors(settings: Config, name: str) -> Iterator[InputError]:
+    """The prior of a scene is one of the settings, or a file."""
+    prior, laws = settings.scenes[name].prior, settings.priors.laws
+    if "/" not in prior and "." not in prior and prior not in laws:
+        yield InputError(f"scenes.{name}.prior", f"no prior '{prior}' in priors.laws{hint(prior, laws)}")
 
 
 def _video_errors(settings: Config, name: str) -> Iterator[InputError]:

@@ -6,15 +6,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from neuma_lib.config.capture import CapturesConfig
 from neuma_lib.config.priors import PriorsConfig
 from neuma_lib.config.simulation import SimulationConfig
 from neuma_lib.config.validation import hint, validate, with_advanced
 from neuma_lib.errors import InputError
 from neuma_lib.extensions import load_laws
-from neuma_lib.io.files import one_line
+from neuma_lib.io.yaml_files import load_yaml
 from neuma_lib.methods.registry import built_in_presets
 from neuma_lib.project.consistency import check_consistency
 from neuma_lib.project.random_scenes import RandomConfig, draw_scenes
@@ -41,17 +39,22 @@ def load(
     scenes_file = Path(root) / str(raw.get("scenes_file", Config.model_fields["scenes_file"].default))
     named = read_yaml(scenes_file)
     refuse_old_keys({"scenes": named})
-    scenes, changes = {**named, **_random_scenes(raw)}, raw.get("scenes") or {}
-    for name in captured or {}:
-        if name in scenes:
-            raise InputError(f"scenes.{name}", "a capture has a scene of this name", "Rename one of the two")
-    scenes |= captured or {}
+    scenes, changes = dict(named), raw.get("scenes") or {}
+    for kind, others in {
+        "random settings have": _random_scenes(raw),
+        "a capture has": captured or {},
+    }.items():
+        for name in others.keys() & scenes.keys():
+            raise InputError(f"scenes.{name}", f"{kind} a scene of this name", "Rename one of the two")
+        scenes |= others
     if isinstance(changes, Mapping):
         changes = _complete(_with_takes(merged(scenes, changes)))
     extensions = _extensions(raw, root)
-    presets = merged(built_in_presets(extensions), raw.get("methods") or {})
+    presets = raw.get("methods") or {}
+    if isinstance(presets, Mapping):
+        presets = merged(built_in_presets(extensions), presets)
     settings = validate(Config, {**raw, "extensions": extensions, "scenes": changes, "methods": presets})
-    check_consistency(settings)
+    check_consistency(settings, root)
     return settings
 
 
@@ -63,7 +66,9 @@ def load_captures(raw: Mapping[str, Any]) -> CapturesConfig:
 def _extensions(raw: Mapping[str, Any], root: str | Path) -> tuple[str, ...]:
     """Paths of the extensions, which are loaded."""
     files = raw.get("extensions") or ()
-    if not isinstance(files, list | tuple) or not all(isinstance(file, str) for file in files):
+    if not isinstance(files, list | tuple) or not all(
+        isinstance(file, str) and file.endswith(".py") for file in files
+    ):
         raise InputError("extensions", f"{files!r} is not a list of Python files", "Write [my_method.py]")
     paths = tuple(str(Path(root) / file) for file in files)
     load_laws(paths)
@@ -106,7 +111,7 @@ def _complete(scenes: Mapping[str, Any]) -> dict[str, Any]:
         like = scene.get("like") if isinstance(scene, Mapping) else None
         if like is None:
             return scene
-        if like not in scenes:
+        if not isinstance(like, str) or like not in scenes:
             raise InputError(f"scenes.{name}.like", f"no scene '{like}'{hint(like, scenes)}")
         if like in (name, *asked):
             raise InputError(f"scenes.{name}.like", f"{like} is in turn like {name}")
@@ -117,21 +122,11 @@ def _complete(scenes: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read_yaml(path: str | Path) -> dict[str, Any]:
-    """A YAML file as a dict. Raises InputError naming the file when it is missing or not a mapping."""
-    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the same values, several times as fast
-    try:
-        content = yaml.load(Path(path).read_text(), Loader=loader)
-    except FileNotFoundError:
-        raise InputError(
-            path, "the file does not exist", "Give the path of an existing settings file"
-        ) from None
-    except yaml.YAMLError as error:
-        raise InputError(path, f"invalid YAML: {one_line(error)}") from None
-    if content is None:
-        return {}
-    if not isinstance(content, dict):
+    """A YAML file as a dict. Raises InputError: see `load_yaml`, or it is not a mapping."""
+    content = load_yaml(path, "Give the path of an existing settings file")
+    if not isinstance(content or {}, dict):
         raise InputError(path, f"expected lines 'key: value', not a {type(content).__name__}")
-    return content
+    return content or {}
 
 
 def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,11 +32,17 @@ class Project(NamedTuple):
     root: Path
 
     @classmethod
-    def find(cls, place: str | Path, configfiles: Sequence[str | Path] = ()) -> Project:
+    def find(
+        cls,
+        place: str | Path,
+        configfiles: Sequence[str | Path] = (),
+        log: Callable[[InputError], None] = lambda error: None,
+    ) -> Project:
         """The project that a folder lies in.
 
         Args:
             configfiles: settings on top of those of the project, in this order, as by Snakemake's ``--configfile``.
+            log: called for each capture that has no scenes, as by `captured_scenes`.
 
         Raises:
             InputError: see `project_folder`, or the settings are not valid.
@@ -44,10 +50,13 @@ class Project(NamedTuple):
         root = project_folder(place)
         raw: dict[str, Any] = {}
         for file in (root / SETTINGS_FILE, *configfiles):
-            raw = merged(raw, read_yaml(file))
+            if not (content := read_yaml(file)):
+                raise InputError(file, "the file is empty", "Write settings into it, or leave it out")
+            raw = merged(raw, content)
         captures = load_captures(raw)
         released = {
             name: item.model_copy(update={"folder": str(root / item.folder)})
             for name, item in captures.released.items()
         }
-        return cls(load(raw, root, captured=captured_scenes(root / captures.root, released)), root)
+        captured = captured_scenes(root / captures.root, released, log=log)
+        return cls(load(raw, root, captured=captured), root)

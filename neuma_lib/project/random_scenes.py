@@ -14,9 +14,9 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
-from pydantic import AfterValidator, ConfigDict, Field, PositiveFloat, model_validator
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, PositiveFloat, model_validator
 
-from neuma_lib.config.base import Section, Vector, internal
+from neuma_lib.config.base import Section, Seed, Vector, internal, no_boolean
 from neuma_lib.config.laws import LawConfig
 from neuma_lib.errors import InputError
 
@@ -82,7 +82,9 @@ def _ascending(pair: tuple[float, float]) -> tuple[float, float]:
 
 
 Range = Annotated[tuple[float, float], AfterValidator(_ascending)]
-PositiveRange = Annotated[tuple[PositiveFloat, PositiveFloat], AfterValidator(_ascending)]
+PositiveRange = Annotated[
+    tuple[PositiveFloat, PositiveFloat], BeforeValidator(no_boolean), AfterValidator(_ascending)
+]
 
 
 class DrawnPart(Section):
@@ -124,8 +126,8 @@ class FamilyConfig(Section):
 class RandomConfig(Section):
     """Random scenes, with names such as random7_03_duck_von_mises."""
 
-    count: int = Field(0, ge=0, description="number of scenes; a larger number keeps the first ones")
-    seed: int = Field(0, ge=0, description="seed of the scenes")
+    count: int = Field(0, ge=0, le=500, description="number of scenes; a larger number keeps the first ones")
+    seed: Seed = Field(0, description="seed of the scenes")
     methods: tuple[str, ...] = Field(
         ("nclaw", "neuma", "constants", "neuma_structured", "true_law"),
         min_length=2,
@@ -292,15 +294,11 @@ def _flaw(settings: RandomConfig, scene: Mapping[str, Any], gravity: Vector) -> 
     """
     proportions = SHAPES[scene["shape"]]
     half = scene["size"] * np.array(proportions.sides) / 2
-    offset = scene["size"] * np.array(proportions.mass_centre)
     middle = np.array([scene["center"][0], scene["height"], scene["center"][1]])
     if (middle - half < MARGIN).any() or (middle + half > 1 - MARGIN).any():
         return "outside"
-    t = np.linspace(0, scene["duration"], MOMENTS + 1)[:, None]
-    turned = _rotations(np.array(scene["spin"]), t[:, 0])
-    flight = middle + offset + t * np.array(scene["velocity"]) + t**2 / 2 * np.array(gravity)
-    middle = flight - turned @ offset
-    box, ellipsoid = np.abs(turned * half).sum(axis=2), np.linalg.norm(turned * half, axis=2)
+    middle, turned = flight(scene, scene["size"], gravity, scene["duration"])
+    box, ellipsoid = np.abs(turned).sum(axis=2), np.linalg.norm(turned, axis=2)
     earliest, latest = settings.contact
     if _first((middle - box)[:, 1] <= 0) < earliest * MOMENTS:
         return "early"
@@ -309,6 +307,26 @@ def _flaw(settings: RandomConfig, scene: Mapping[str, Any], gravity: Vector) -> 
         return "late"
     touched = np.concatenate([(middle - box)[:, ::2] <= 0, middle + box >= 1], axis=1)
     return "wall" if _first(touched.any(axis=1)) <= landing else None
+
+
+def flight(
+    scene: Mapping[str, Any], size: float, gravity: Vector, duration: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Motion of the bounding box of one of `SHAPES` before contact, at `MOMENTS` + 1 times from 0 to the duration [s].
+
+    Args:
+        size: longest side of the box [m].
+
+    Returns:
+        positions of its centre (T, 3) [m], and its three half axes as columns (T, 3, 3) [m].
+    """
+    proportions = SHAPES[scene["shape"]]
+    half, offset = size * np.array(proportions.sides) / 2, size * np.array(proportions.mass_centre)
+    middle = np.array([scene["center"][0], scene["height"], scene["center"][1]])
+    t = np.linspace(0, duration, MOMENTS + 1)[:, None]
+    turned = _rotations(np.array(scene["spin"]), t[:, 0])
+    path = middle + offset + t * np.array(scene["velocity"]) + t**2 / 2 * np.array(gravity)
+    return path - turned @ offset, turned * half
 
 
 def _rotations(spin: np.ndarray, t: np.ndarray) -> np.ndarray:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from neuma_lib.config.variants import name_problem
 from neuma_lib.errors import InputError
-from neuma_lib.project.capture_folder import NAME
 from neuma_lib.project.capture_scenes import scene_name
 from neuma_lib.project.settings import Config
 
@@ -75,6 +75,8 @@ def new_scene(root: Path, name: str, settings: Config) -> Path:
         raise InputError(
             name, "a scene's name must consist of letters, digits and _, and begin with a letter"
         )
+    if problem := name_problem(name):
+        raise InputError(name, problem)
     if name in settings.scenes or name in settings.experiments:
         raise InputError(name, "a scene or experiment of this name exists", "Choose another name")
     return _written(root / "config" / f"{name}.yaml", SCENE.format(name=name))
@@ -86,8 +88,8 @@ def new_capture(root: Path, name: str, settings: Config) -> Path:
     Raises:
         InputError: a name that cannot be used, or that exists.
     """
-    if not NAME.fullmatch(name):
-        raise InputError(name, "a capture's name must consist of letters, digits, - and _")
+    if problem := name_problem(name):
+        raise InputError(name, problem)
     if {name, scene_name(name, "first")} & settings.scenes.keys():
         raise InputError(name, "a scene of this name exists", "Choose another name")
     folder = root / settings.captures.root / name

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from neuma_lib.config.base import Section
+from neuma_lib.config.base import Section, Seed
 from neuma_lib.config.binding import BindingConfig
 from neuma_lib.config.capture import CapturesConfig
 from neuma_lib.config.dataset import DatasetConfig, TruthConfig
@@ -53,7 +53,7 @@ class Config(Section):
     device: Literal["auto", "cpu", "cuda"] = Field(
         "auto", description="device of all computations; auto: CUDA if there is a GPU"
     )
-    seed: int = Field(0, description="seed of every stage without its own seed")
+    seed: Seed = Field(0, description="seed of every stage without its own seed")
     extensions: tuple[str, ...] = Field(
         (), description="Python files with own methods and laws, relative to the folder of the project"
     )
@@ -96,6 +96,11 @@ class Config(Section):
     def scene(self, name: str) -> SceneConfig:
         """The scene of a name or of the folder of a replicate."""
         return self.scenes[parse_replicate(name, self.scenes, "scene")[0]]
+
+    def is_own_capture(self, name: str) -> bool:
+        """Whether a scene is one of a capture in the folder of captures."""
+        captured = self.scene(name).captured
+        return captured is not None and captured.capture not in self.captures.released
 
     @property
     def random_scenes(self) -> list[str]:

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,11 +10,12 @@ import torch
 
 from neuma_lib.config.identify import IdentifyConfig
 from neuma_lib.config.laws import LawConfig
+from neuma_lib.config.training import TrainingConfig
 from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.errors import NonFiniteError
 from neuma_lib.fitting.families import Family
 from neuma_lib.fitting.family_run import FamilyRun
-from neuma_lib.fitting.frame_batches import first_contact
+from neuma_lib.fitting.frame_batches import check_contact, first_contact
 from neuma_lib.fitting.identified import FamilyFit
 from neuma_lib.fitting.identify import _better_later, _prune, _select, identify
 from neuma_lib.fitting.least_squares import Linearisation, jackknife, levenberg_marquardt
@@ -21,8 +23,12 @@ from neuma_lib.fitting.video_residuals import VideoResiduals, averaged
 from neuma_lib.io.files import write_json
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.combinations import named_combinations
+from neuma_lib.methods.base import Problem
+from neuma_lib.methods.spring_gaus.method import SpringGaus
+from neuma_lib.methods.training import Training
 from neuma_lib.sim.model import COURANT_LIMIT
 from neuma_lib.sim.rollout import rollout
+from neuma_lib.sim.state import State
 from neuma_lib.splatting.observation import Observation
 from tests.support.errors import refused
 from tests.support.grounding_scene import MODEL, RADIUS, ball, observe
@@ -458,6 +464,43 @@ def test_few_frames_and_unknown_constants_are_named():
     both = {"name": "von_mises", "yield_stress": 1e3, "nu": 0.2}
     with refused("identify.families.x.plasticity"):
         Family("x", ELASTIC | {"plasticity": both})
+
+
+@pytest.mark.parametrize(("v0", "contact"), [(V0, "0.08"), ((0.0, 1.0, 0.0), "0.3")])
+def test_a_video_without_contact_is_refused_before_anything_is_fitted(v0, contact, monkeypatch):
+    monkeypatch.setattr("neuma_lib.fitting.identify.VideoResiduals", None)
+    body, frames = ball(), (0, 8, 16, 24)
+    with refused("frames", problem=f"first contact, expected at about {contact}", remedy="longer video"):
+        identify(MODEL, known(body, v0=v0), body, observe(body, v0, frames), settings({"hencky": ELASTIC}))
+
+
+@pytest.mark.parametrize("fit", [Training, lambda *values: SpringGaus().fit(values[0], {}, *values[3:])])
+def test_methods_that_train_refuse_it_too(fit, monkeypatch):
+    body = ball(dtype=torch.float32)
+    seen = observe(body, V0, (0, 8, 16, 24))
+    for module in ("methods.training", "io.particles"):
+        monkeypatch.setattr(f"neuma_lib.{module}.load_reconstruction", lambda *files, **options: body)
+        monkeypatch.setattr(f"neuma_lib.{module}.with_motion", lambda body, file: body.state(V0))
+    for module in ("methods.training", "io.images"):
+        monkeypatch.setattr(f"neuma_lib.{module}.load_videos", lambda *files, **exposure: [seen])
+    inputs = dict.fromkeys(("particles", "binding", "gaussians", "velocity", "transforms"), "none")
+    problem = Problem({"dt": MODEL.dt, "grid": MODEL.grid}, [1000.0], {})
+    with refused("frames", problem="first contact"):
+        fit(inputs, {}, TrainingConfig(), problem, SimpleNamespace(device=torch.device("cpu")))
+
+
+def test_a_turning_body_touches_the_floor_where_one_without_spin_does_not():
+    """A bar of 0.8 m, 0.3 m above the floor, without gravity. After 100 steps the spin has turned it by 90 degrees."""
+    bar = torch.tensor([[x, 0.3, 0.5] for x in (0.1, 0.5, 0.9)], dtype=torch.float64)
+    ones, model = torch.ones(3, dtype=torch.float64), replace(MODEL, gravity=(0.0, 0.0, 0.0))
+    still, turning = (
+        State.rigid(bar, ones, ones, (0.0, 0.0, 0.0), (0.0, 0.0, spin))
+        for spin in (0.0, math.pi / 2 / (100 * model.dt))
+    )
+    check_contact(model, [(turning, (0, 100))])
+    check_contact(model, [(still, (0, 100)), (turning, (0, 100))])  # the other video shows the material
+    with refused("frames", problem="first contact is missing"):
+        check_contact(model, [(still, (0, 100))])
 
 
 class Line:

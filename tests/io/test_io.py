@@ -1,12 +1,16 @@
 """Reading gives what was written, equal content gives equal bytes, and damaged files are reported."""
 
+import errno
 import json
+import os
+import resource
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
+from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.io.files import atomic, read_json, write_json
 from neuma_lib.io.gaussians import load_gaussians, save_gaussians
 from neuma_lib.io.hdf5 import read_arrays, write_arrays
@@ -43,6 +47,36 @@ def test_a_failing_writer_leaves_the_old_file_and_nothing_else(tmp_path):
         raise RuntimeError
     assert read_json(path) == {"a": 1}
     assert [p.name for p in tmp_path.iterdir()] == ["metrics.json"]
+
+
+WRITERS = {
+    "json": lambda path: write_json(path, list(range(10_000))),
+    "HDF5": lambda path: write_arrays(path, {"x": np.zeros((10_000, 3))}),
+    "safetensors": lambda path: write_weights(path, {"w": torch.zeros(10_000)}, {}),
+    "checkpoint": lambda path: Checkpoint(path, {}).save({"w": torch.zeros(10_000)}),
+}
+
+
+@pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
+def test_a_full_disk_is_one_line_and_leaves_no_file(tmp_path, write):
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))  # as if the disk had 10 kB left
+    try:
+        with refused("target", problem="cannot be written", remedy="Free disk space"):
+            write(tmp_path / "target")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("number", [errno.EROFS, errno.EACCES])
+def test_a_read_only_folder_is_one_line(tmp_path, monkeypatch, number):
+    def mkdir(*_, **__):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr("pathlib.Path.mkdir", mkdir)
+    with refused("target", problem="cannot be written", remedy="results_root"):
+        write_json(tmp_path / "target", {})
 
 
 def test_the_name_keeps_its_ending_while_written(tmp_path):

@@ -1,12 +1,14 @@
 """Fit of a voxel radiance field: quality through particles, what these weigh, refinement, resuming, bad input."""
 
 import math
+from dataclasses import asdict
 
 import pytest
 import torch
 
 from neuma_lib.errors import InputError
 from neuma_lib.io.checkpoint import Checkpoint
+from neuma_lib.io.weights import write_weights
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.methods.pac_nerf.field import RadianceField
 from neuma_lib.methods.pac_nerf.field_fit import fit_radiance_field
@@ -189,12 +191,27 @@ def test_file_round_trip(tmp_path, fit, duck):
 
 
 def test_foreign_file_is_named(tmp_path):
-    from neuma_lib.io.weights import write_weights
-
     path = tmp_path / "other.safetensors"
     write_weights(path, {"weight": torch.zeros(3)}, {})
     with refused("other.safetensors"):
         load_field(path)
+
+
+@pytest.mark.parametrize("nodes", [(400, 400, 400), (10**6,) * 3, (26, 26, 25)])
+def test_a_file_that_claims_other_nodes_than_it_has_is_refused_before_they_are_allocated(
+    tmp_path, monkeypatch, nodes
+):
+    field, path = ball(), tmp_path / "claims.safetensors"
+    claimed = {"lattice": {**asdict(field.lattice), "nodes": nodes}, "opacity": asdict(field.opacity)}
+    write_weights(path, field.state_dict(), claimed)
+    monkeypatch.setattr(RadianceField, "__init__", None)
+    with refused(path, problem="densities of shape (26, 26, 26, 1)"):
+        load_field(path)
+
+
+def test_a_lattice_of_too_many_nodes_is_refused_before_it_is_allocated():
+    with refused("lattice", problem="nodes exceed", remedy="radiance.voxel"):
+        RadianceField(Lattice((0.0, 0.0, 0.0), 1e-3, (1000, 1000, 1000)), Opacity(1e-4, 1e-3))
 
 
 def test_bad_input_is_named(duck):

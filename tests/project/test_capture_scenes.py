@@ -10,8 +10,9 @@ from neuma_lib.capture.motion.synchronisation import (
     reduced_intrinsics,
     without_gain,
 )
+from neuma_lib.config.capture import ReleasedConfig
 from neuma_lib.errors import InputError
-from neuma_lib.project import cases
+from neuma_lib.project import cases, checks
 from neuma_lib.project.capture_scenes import captured_scenes
 from neuma_lib.project.loading import load, read_yaml
 from neuma_lib.project.settings import NO_TRUTH
@@ -63,6 +64,56 @@ def test_takes_that_are_held_out_train_nothing(captures):
     assert scenes["mug_two"].videos == () and scenes["mug_one"].videos == ()
     settings(captures, "held_out: [one, two]\n")
     assert captured_scenes(captures) == {}  # its own rules report the error
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "board: [",
+        "a: &a [*a]",
+        "&a 1: *a",
+        "board: {square: true}",
+        "board: {square: .inf}",
+        "prior: a\nprior: b",
+        "{1: 2}",
+        "[" * 10_000,
+        "lens: [x]",
+    ],
+)
+def test_a_broken_capture_leaves_other_scenes_usable(captures, text):
+    (captures / "cup").mkdir()
+    (captures / "cup/capture.yaml").write_text(text)
+    broken = []
+    scenes = captured_scenes(captures, log=broken.append)
+    assert {"mug", "mug_one", "mug_two"} == scenes.keys()
+    (error,) = broken
+    assert "cup/capture.yaml" in error.where and len(str(error).splitlines()) == 1
+
+
+def test_a_capture_of_an_unknown_prior_leaves_other_scenes_usable(captures):
+    """It is an error of `neuma check` and of the targets that read the prior."""
+    settings(captures, "prior: jely\n")
+    config = loaded(captures)
+    (problem,) = {line.partition(": ")[2] for line in checks.local_problems(config)}
+    assert "no prior 'jely'" in problem and not checks.problems(config)
+
+
+@pytest.mark.parametrize(
+    ("name", "problem"), [("logs", "reserved"), ("a.b", "letters"), ("mug_one", "mug_one")]
+)
+def test_captures_whose_names_are_taken_are_left_out(captures, name, problem):
+    (captures / name).mkdir()
+    (captures / name / "capture.yaml").write_text("board: {square: 0.03}\n")
+    broken = []
+    assert {"mug", "mug_one", "mug_two"} == captured_scenes(captures, log=broken.append).keys()
+    assert [problem in str(error) for error in broken] == [True]
+
+
+def test_a_released_capture_that_is_missing_leaves_other_scenes_usable(captures):
+    broken = []
+    missing = {"bun": ReleasedConfig(folder=str(captures / "nowhere"))}
+    assert {"mug", "mug_one", "mug_two"} == captured_scenes(captures, missing, log=broken.append).keys()
+    assert "nowhere" in broken[0].where
 
 
 def test_the_truth_of_a_capture_is_unknown(captures):

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from neuma_lib.config import simulation
 from neuma_lib.config.base import Section
 from neuma_lib.config.variants import SEEDS, parse_replicate, replicate_folder
 from neuma_lib.errors import InputError
@@ -91,6 +92,54 @@ MISTAKES = [
     ({"advanced": {"identify.spread": -2}}, "identify.spread"),
     ({"identify": {"spread": 2}}, "identify.spread"),
     ({"gaussians": {"densification": {"every": 3}}}, "gaussians.densification.every"),
+    ({"methods": 3}, "methods"),
+    ({"extensions": ["os"]}, "extensions"),
+    ({"scenes": {"New": {"like": ["BouncyBall"]}}}, "scenes.New.like"),
+    ({"simulation": {"boundary": "no_slp"}}, "simulation.boundary"),
+    ({"simulation": {"boundary": {"x_mn": "slip"}}}, "simulation.boundary"),
+    ({"scenes": {"BouncyBall": {"appearance": {"accent": "red"}}}}, "scenes.BouncyBall.appearance.accent"),
+    ({"random": {"count": 1_000_000}}, "random.count"),
+    ({"advanced": {"radiance.particles": 10**9}}, "radiance.particles"),
+    ({"advanced": {"radiance.voxel": 1e-4}}, "radiance.voxel"),
+    ({"seed": -1}, "seed"),
+    ({"training": {"seed": 10**40}}, "training.seed"),
+    # booleans are no numbers
+    ({"training": {"rank": True}}, "training.rank"),
+    ({"training": {"views": [False]}}, "training.views"),
+    ({"advanced": {"random.velocity": [[0, 1], [0, True], [0, 1]]}}, "random.velocity"),
+    ({"scenes": {"BouncyBall": {"density": True}}}, "scenes.BouncyBall.density"),
+    ({"scenes": {"BouncyBall": {"training": {"rank": True}}}}, "scenes.BouncyBall.training.rank"),
+    ({"scenes": {"BouncyBall": {"law": {"elasticity": {"E": True}}}}}, "scenes.BouncyBall.law.elasticity.E"),
+    ({"methods": {"neuma": {"options": {"rank": True}}}}, "methods.neuma.options.rank"),
+    # names are folders and parts of patterns
+    *[
+        ({"scenes": {name: {"like": "BouncyBall"}}}, f"scenes.{name}")
+        for name in ("a.b", "a b", "a/b", "{a}", "a*", "", "-a", "figures", "none", "a" * 81)
+    ],
+    ({"methods": {"a.b": {"title": "x", "kind": "neuma"}}}, "methods.a.b"),
+    ({"tables": {"../a": {"scenes": ["BouncyBall"]}}}, "tables.../a"),
+]
+NOT_FINITE = [float("nan"), float("inf"), -float("inf"), "nan", "inf", 10**400]
+MISTAKES += [({"training": {"lr_elastic": value}}, "training.lr_elastic") for value in NOT_FINITE]
+MISTAKES += [
+    ({"scenes": {"BouncyBall": {"velocity": [0, value, 0]}}}, "scenes.BouncyBall.velocity.1")
+    for value in NOT_FINITE
+]
+MISTAKES += [
+    ({"scenes": {"BouncyBall": {"law": {"elasticity": {"E": value}}}}}, "scenes.BouncyBall.law.elasticity.E")
+    for value in NOT_FINITE
+]
+MISTAKES += [
+    ({"results_root": folder}, "results_root")
+    for folder in ("", " ", "/", "//", "~", "~/x", ".", "..", "results/..", "/tmp", "/etc/x", "a{b}", "a\0")
+]
+MISTAKES += [
+    ({"results_root": str(Path.home())}, "results_root"),
+    ({"results_root": "config/x"}, "results_root"),
+    ({"results_root": "data/"}, "results_root"),
+    ({"data_root": ""}, "data_root"),
+    ({"kernel_cache": "/"}, "kernel_cache"),
+    ({"captures": {"root": ""}}, "captures.root"),
 ]
 
 
@@ -98,6 +147,23 @@ MISTAKES = [
 def test_mistakes_are_named(changed, change, place):
     with first_refused(place):
         changed(**change)
+
+
+def test_a_scene_is_not_replaced_by_a_random_one_of_its_name(raw, loaded, tmp_path):
+    name = next(iter(loaded.random_scenes))
+    (tmp_path / "scenes.yaml").write_text(f"{name}: {{shape: ball}}\n")
+    with refused(f"scenes.{name}"):
+        loading.load({**raw, "scenes_file": str(tmp_path / "scenes.yaml")}, ROOT)
+
+
+def test_folders_outside_of_the_project_can_hold_results(changed):
+    for folder in ("/mnt/disk/results", "../elsewhere/results", "/dev/shm/results", "my results/"):
+        assert changed(results_root=folder).results_root == folder
+
+
+def test_names_of_walls_are_those_of_the_simulator():
+    model = pytest.importorskip("neuma_lib.sim.model")
+    assert (simulation.WALLS, simulation.CONDITIONS) == (model.WALLS, model.CONDITIONS)
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,8 @@
 Jobs are read from two plans: one with the settings of tiny.yaml, and one with more scenes, tables, figures and devices.
 """
 
+import shutil
+
 import pytest
 
 from neuma_lib.errors import InputError
@@ -431,6 +433,12 @@ def test_motions_of_springs_and_of_experiments_are_exported_too(plan):
             [*overlay(extensions=["no_such_file.py"]), TABLE],
             "/no_such_file.py does not exist. Paths are relative to the working directory",
         ),
+        ([*overlay(training={"views": [7]}), TABLE], "training.views: no view 7"),
+        (
+            [*overlay(scenes={"BouncyBall": {"law": {"elasticity": {"E": 5e9}}, "height": 0.0}}), TABLE],
+            "scenes.BouncyBall.law: the Courant number",
+        ),
+        ([*overlay(results_root="/"), TABLE], "results_root: / holds more than this project's files"),
         ([f"{SCENE}/neuma+rnk=3/metrics.json"], "no option 'rnk'; did you mean rank"),
         ([f"{SCENE}+sed=3/gaussians.ply"], "no option 'sed'; did you mean seed"),
         (
@@ -457,6 +465,40 @@ def test_what_cannot_be_had_ends_with_one_line_before_anything_runs(project, wor
     output = project.run(*words, succeeds=False)
     assert message in output and "Traceback (most recent call last)" not in output
     assert not (project.root / "tiny").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("seed: 1\nseed: 2\n", "line 2, column 1: the key 'seed' is in line 1 already"),
+        (
+            "a0: &a0 [x, x]\n" + "".join(f"a{k}: &a{k} [{f'*a{k - 1}, ' * 9}]\n" for k in range(1, 12)),
+            "with its aliases (*name) it expands to more than",
+        ),
+    ],
+)
+def test_files_of_settings_that_snakemake_accepts_are_refused(project, tmp_path, text, message):
+    """Snakemake keeps the last value of a key, and bounds no aliases."""
+    file = tmp_path / "mine.yaml"
+    file.write_text(text)
+    assert f"{file}: " in (output := project.run("--configfile", str(file), "--", TABLE, succeeds=False))
+    assert message in output
+
+
+def test_a_broken_capture_stops_its_own_targets_only(project):
+    capture = project.root / "captures/mug/capture.yaml"
+    capture.parent.mkdir(parents=True)
+    capture.write_text("a: &a [x, x]\nboard: [*a\n")
+    try:
+        output = project.run("--dry-run", f"{SCENE}/gaussians.ply")
+        assert "captures/mug/capture.yaml: line 3, column 1: invalid YAML" in output
+        refused_target = project.run("--dry-run", f"{RESULTS}/mug/capture.md", succeeds=False)
+        assert refused_target.count("captures/mug/capture.yaml: line 3") > output.count(
+            "capture.yaml: line 3"
+        )
+        assert "Traceback (most recent call last)" not in refused_target
+    finally:
+        shutil.rmtree(capture.parent)
 
 
 def test_settings_are_refused_where_they_are_read(tiny_settings):

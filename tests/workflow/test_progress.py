@@ -2,6 +2,7 @@
 
 import fcntl
 import io
+import itertools
 import os
 import pty
 import re
@@ -95,11 +96,26 @@ def test_plain_lines_now_and_then_where_there_is_no_terminal(monkeypatch, tmp_pa
     assert "5/5, loss 1" in (tmp_path / "log").read_text()
 
 
+def test_lines_go_on_when_the_clock_jumps_back(monkeypatch):
+    monkeypatch.setattr(progress, "PLAIN_INTERVAL", 0.0)
+    hours = itertools.count(0, -3600)
+    monkeypatch.setattr("tqdm.std.time", lambda: float(next(hours)))
+    stream = io.StringIO()
+    with progress.stage("gaussians Ball", None, stream) as run:
+        for i in range(5):
+            run.progress(i + 1, 5)
+    assert re.search(r"4/5, 00:00 left", stream.getvalue())
+
+
 @pytest.mark.parametrize(
     ("error", "shown"),
     [
         (InputError("a.png is truncated: replace it"), "ERROR: a.png is truncated: replace it"),
         (NonFiniteError("material", "iteration 3"), "ERROR: material: iteration 3"),
+        (
+            OSError(28, "No space left on device", "a.png"),
+            "ERROR: a.png: cannot be written: No space left on device. Free disk space and run the same command again.",
+        ),
         (KeyError("x"), "ERROR: KeyError: 'x'"),
         (KeyboardInterrupt(), "ERROR: interrupted; run the same command again to go on"),
     ],
@@ -111,6 +127,15 @@ def test_errors_are_reported_in_one_line_and_logged_in_full(tmp_path, error, sho
     assert end.value.code == 1
     assert stream.getvalue() == f"mesh Ball: {shown} (more in {log})\n"
     assert "Traceback" in log.read_text() and type(error).__name__ in log.read_text()
+
+
+def test_a_log_on_a_full_disk_adds_no_error(capsys):
+    """/dev/full refuses every byte, as a full disk does."""
+    stream = io.StringIO()
+    with pytest.raises(SystemExit), progress.stage("mesh Ball", "/dev/full", stream):
+        raise OSError(28, "No space left on device")
+    assert stream.getvalue().startswith("mesh Ball: ERROR: output: cannot be written: No space left")
+    assert capsys.readouterr().err == ""
 
 
 def test_warnings_go_to_the_log(tmp_path):

@@ -2,7 +2,8 @@
 
 from functools import cache
 
-from neuma_lib.project.capture_folder import NAME, inside, read_capture
+from neuma_lib.config.variants import NAME, RESERVED
+from neuma_lib.project.capture_folder import inside, read_capture
 from neuma_lib.project.released_captures import released_captures
 
 CAPTURES = SETTINGS.captures.root.rstrip("/")
@@ -27,7 +28,7 @@ VIDEO_FRAMES = f"{RESULTS}/{{capture}}/frames/{VIDEO}"
 FLIGHT = f"{RESULTS}/{{capture}}/flight/{{take}}"
 
 # Names of folders with other results.
-OTHERS = f"{TRUE_SCENE}|{SPLAT_SCENE}|figures|logs|benchmarks|experiments|priors"
+OTHERS = "|".join([TRUE_SCENE, SPLAT_SCENE, *RESERVED])
 RELEASED_CAPTURE = names_of(SETTINGS.captures.released, replicates=False)
 OWN_CAPTURE = f"(?!({OTHERS}|{RELEASED_CAPTURE})/){NAME.pattern}"
 RELEASED_TAKE = scenes_that(

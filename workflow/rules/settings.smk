@@ -8,10 +8,12 @@ from pathlib import Path
 ROOT = Path(workflow.current_basedir.get_path_or_uri(secret_free=True)).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
+from snakemake.logging import logger
+
 from neuma_lib.project.capture_scenes import captured_scenes
-from neuma_lib.project.checks import law_problems
+from neuma_lib.project.checks import local_problems, problems
 from neuma_lib.project import cases
-from neuma_lib.project.loading import load, load_captures
+from neuma_lib.project.loading import load, load_captures, read_yaml
 from neuma_lib.errors import InputError
 from neuma_lib.mechanics.catalogue import DEFINED_IN
 from neuma_lib.methods.registry import methods
@@ -20,14 +22,23 @@ from workflow.provenance import code_digest
 from workflow.records import keep_records_of_failed_jobs
 
 try:
+    # Snakemake has read them, but keeps the last of repeated keys and bounds no aliases.
+    for file in filter(os.path.isfile, workflow.configfiles if workflow.is_main_process else ()):
+        read_yaml(file)
     captures = load_captures(config)
     # A workflow that includes this one may plan captures before their files exist.
     PLANNED = plan_captures(config, captures.root) if "plan_captures" in globals() else {}
-    SETTINGS = load(config, captured=captured_scenes(captures.root, captures.released, PLANNED))
+    BROKEN = []  # captures that have no scenes, which stop only the targets that need them
+    SETTINGS = load(
+        config, captured=captured_scenes(captures.root, captures.released, PLANNED, BROKEN.append)
+    )
 except InputError as error:
     raise WorkflowError(str(error)) from None
-if wrong_laws := law_problems(SETTINGS):
-    raise WorkflowError("\n".join(wrong_laws))
+if workflow.is_main_process:
+    if wrong := problems(SETTINGS):
+        raise WorkflowError("\n".join(wrong))
+    for problem in [*map(str, BROKEN), *local_problems(SETTINGS)]:
+        logger.warning(problem)
 
 KINDS = methods(SETTINGS.extensions)
 DATA = SETTINGS.data_root.rstrip("/")

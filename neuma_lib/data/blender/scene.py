@@ -7,6 +7,7 @@ the target folder when all are rendered. The object is a `Surface` (moving mesh 
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import shutil
@@ -129,9 +130,9 @@ def render_images(
     for abandoned in out_dir.glob(".render-*"):  # from a killed process
         shutil.rmtree(abandoned)
     with tempfile.TemporaryDirectory(prefix=".render-", dir=out_dir) as folder:
-        job = Path(folder) / "job.npz"
+        job, content = Path(folder) / "job.npz", io.BytesIO()  # savez leaves a file open on a full disk
         np.savez(
-            job,
+            content,
             **geometry.arrays(),
             c2w=views.c2w,
             focal=views.focal,
@@ -141,6 +142,7 @@ def render_images(
             threads=threads,
             device=device,
         )
+        job.write_bytes(content.getbuffer())
         run_worker(worker.__name__, job, len(shots), progress)
         for index, name in enumerate(names):
             image = Path(folder) / f"{index:05d}.png"

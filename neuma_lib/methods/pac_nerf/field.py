@@ -6,12 +6,14 @@ that the diffuse shell of a field is light and soft.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
+from neuma_lib.errors import InputError
 from neuma_lib.methods.pac_nerf.lattice import Lattice, from_particles, interpolate
 from neuma_lib.methods.pac_nerf.rendering import (
     FEATURES,
@@ -28,6 +30,8 @@ OCCUPIED = 1e-7
 in PAC-NeRF)."""
 STIFFNESS_POWER = 3
 """Stiffness scales with this power of the opacity of a particle (PAC-NeRF's code)."""
+MAX_NODES = 20_000_000
+"""Nodes of a lattice, of 52 bytes each, three times as many with those of the optimiser."""
 WHITE = (1.0, 1.0, 1.0)
 
 
@@ -81,10 +85,31 @@ class RadianceField(nn.Module):
 
     def __init__(self, lattice: Lattice, opacity: Opacity, network: ColourNetwork | None = None):
         super().__init__()
+        if math.prod(lattice.nodes) > MAX_NODES:
+            raise InputError(
+                "lattice",
+                f"its {' x '.join(map(str, lattice.nodes))} nodes exceed {MAX_NODES}",
+                "Set a larger radiance.voxel, fewer radiance.halvings or fewer radiance.particles",
+            )
         self.lattice, self.opacity = lattice, opacity
         self.network = ColourNetwork() if network is None else network
         self.density = nn.Parameter(torch.zeros(*lattice.nodes, 1))
         self.features = nn.Parameter(torch.zeros(*lattice.nodes, FEATURES))
+
+    @classmethod
+    def of_state(
+        cls,
+        lattice: Lattice,
+        opacity: Opacity,
+        state: Mapping[str, Tensor],
+        network: ColourNetwork | None = None,
+    ) -> RadianceField:
+        """Inverse of ``state_dict``. Raises ValueError, before nodes are allocated, if these are not the lattice's."""
+        if tuple(state["density"].shape) != (*lattice.nodes, 1):
+            raise ValueError(f"densities of shape {tuple(state['density'].shape)} on {lattice.nodes} nodes")
+        field = cls(lattice, opacity, network).to(state["density"])
+        field.load_state_dict(state)
+        return field
 
     def values(self) -> Tensor:
         """Raw density and features, (X, Y, Z, 1 + C)."""

@@ -201,12 +201,9 @@ class _Fit:
         if state is None:
             return 0
         origin, voxel, nodes = state["lattice"]
-        field = RadianceField(
-            Lattice(tuple(origin), voxel, tuple(nodes)), self.field.opacity, self.field.network
-        )
-        field = field.to(self.field.density)
-        field.load_state_dict(state["field"])
-        self._begin(field)
+        lattice, like = Lattice(tuple(origin), voxel, tuple(nodes)), self.field
+        field = RadianceField.of_state(lattice, like.opacity, state["field"], like.network)
+        self._begin(field.to(like.density))
         self.optimizer.load_state_dict(state["optimizer"])
         self.generator.set_state(state["generator"])
         self.order, self.losses = list(state["order"]), list(state["losses"])

@@ -17,16 +17,20 @@ class RadianceConfig(Section):
         1024, "random pixels of a step whose ray intersects the lattice (2^17 of 800 x 800)", ge=1
     )
     particles: int = internal(
-        12000, "approximate number of particles in the hull, which defines the voxel", ge=1
+        12000, "approximate number of particles in the hull, which defines the voxel", ge=1, le=2_000_000
     )
     voxel: float | None = internal(
-        None, "voxel of the coarsest lattice [m] (0.16, some scenes 0.1 or 0.12); null: from particles", gt=0
+        None,
+        "voxel of the coarsest lattice [m] (0.16, some scenes 0.1 or 0.12); null: from particles",
+        ge=0.005,
     )
     hull_resolution: int = internal(
         32, "voxels along the visual hull, in whose box the field starts (a box by hand)", ge=2
     )
     halvings: tuple[float, ...] = internal(
-        (0.17, 0.33, 0.67), "fractions of the iterations at which the voxel is halved (1000, 2000, 4000)"
+        (0.17, 0.33, 0.67),
+        "fractions of the iterations at which the voxel is halved (1000, 2000, 4000)",
+        max_length=6,
     )
     initial_opacity: float = internal(1e-4, "initial opacity over one interval, at raw density 0", gt=0, lt=1)
     spacing: float = internal(

@@ -32,8 +32,7 @@ def load_field(path: str | Path) -> tuple[RadianceField, dict[str, Any]]:
     try:
         nodes = metadata["lattice"]
         lattice = Lattice(tuple(nodes["origin"]), float(nodes["voxel"]), tuple(nodes["nodes"]))
-        field = RadianceField(lattice, Opacity(**metadata["opacity"]))
-        field.load_state_dict(tensors)
+        field = RadianceField.of_state(lattice, Opacity(**metadata["opacity"]), tensors)
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         problem = f"is not a voxel radiance field: {one_line(error)}"
         raise InputError(path, problem, "Run the rule radiance_field again") from None

@@ -52,6 +52,7 @@ class SpringGaus(Method):
 
         import torch
 
+        from neuma_lib.fitting.frame_batches import check_contact
         from neuma_lib.fitting.material import PixelLoss
         from neuma_lib.io.files import write_json
         from neuma_lib.io.images import load_videos
@@ -70,6 +71,8 @@ class SpringGaus(Method):
         videos = load_videos(inputs["transforms"], settings.views, **problem.exposure)
         videos = [video.to(torch.float32, run.device) for video in videos]
         start, density = with_motion(body, inputs["velocity"]), float(body.mass.sum() / body.vol0.sum())
+        loss = PixelLoss(body, videos, settings.covariance_gradient, compare=settings.compare)
+        check_contact(MPM(**problem.simulation), [(start, loss.frames)])
         anchored = SpringBody.of(body.x0, *(getattr(settings, name) for name in OF_NETWORK))
         springs = Springs.of_modulus(
             anchored.network, settings.guess, density, settings.resistance, settings.gap
@@ -85,7 +88,7 @@ class SpringGaus(Method):
             anchored,
             springs,
             start,
-            PixelLoss(body, videos, settings.covariance_gradient, compare=settings.compare),
+            loss,
             settings,
             settings,
             checkpoint=checkpoint,
