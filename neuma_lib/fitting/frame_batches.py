@@ -79,7 +79,7 @@ def _touches(model: MPM, start: State, n: int) -> bool:
         + n * model.dt * velocity
         + model.dt**2 * n * (n + 1) / 2 * gravity
     )
-    return float(contact_clearance(model, x)) <= 0
+    return float(contact_clearance(model, x, start.vol0, (n,))) <= 0
 
 
 def held_out_frames(count: int, share: float, blocks: int = 1, contact: int = 0) -> list[int]:

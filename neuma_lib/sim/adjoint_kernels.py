@@ -126,11 +126,13 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic", contact: bool =
         vol0: wp.array(dtype=real),
         radius: wp.array(dtype=real),
         obstacles: wp.array2d(dtype=Obstacle),
+        stuck: wp.array2d(dtype=vec3),
         grad_grid_rows: wp.array2d(dtype=mat34),
         grad_x: wp.array(dtype=vec3),
         grad_v: wp.array(dtype=vec3),
         grad_C: wp.array(dtype=mat33),
         grad_tau: wp.array(dtype=mat33),
+        grad_stuck: wp.array(dtype=vec3),
     ):
         """From gradients of momentum and mass of the nodes to those of x (added), v, C and tau (set)."""
         p = wp.tid()
@@ -143,7 +145,9 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic", contact: bool =
         A = c.dx * (m * C[now, p] - stress * tau[cached, p])
         v_p = v[now, p]
         if wp.static(contact):
-            v_p = touch(obstacles, pose, c.faces, c.dt, x[now, p], v_p, radius[p])
+            v_p, _stuck, touches = touch(
+                obstacles, pose, c.faces, c.dt, x[now, p], v_p, stuck[now, p], radius[p]
+            )
         q0 = m * v_p - A * f
         q_i = vec4(q0[0], q0[1], q0[2], m)
         step_k = vec3(real(0.0), real(1.0), real(2.0))
@@ -163,8 +167,23 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic", contact: bool =
         g_A = c.dx * mat33(S[1, 0], S[2, 0], S[3, 0], S[1, 1], S[2, 1], S[3, 1], S[1, 2], S[2, 2], S[3, 2])
         g_v = m * g
         if wp.static(contact):
-            g_x, g_v = touch_adjoint(obstacles, pose, c.faces, c.dt, x[now, p], v[now, p], radius[p], g_v)
-            grad_x[p] = grad_x[p] + g_x
+            g_s = vec3()
+            if touches > 0:
+                g_x, g_v_before, g_s = touch_adjoint(
+                    obstacles,
+                    pose,
+                    c.faces,
+                    c.dt,
+                    x[now, p],
+                    v[now, p],
+                    stuck[now, p],
+                    radius[p],
+                    g_v,
+                    grad_stuck[p],
+                )
+                grad_x[p] = grad_x[p] + g_x
+                g_v = g_v_before
+            grad_stuck[p] = g_s
         grad_v[p] = g_v
         grad_C[p] = m * g_A
         grad_tau[p] = -stress * g_A

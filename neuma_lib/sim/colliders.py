@@ -28,8 +28,13 @@ class Collider:
     changes its velocity v before the transfer to the grid. With the time step dt, the outward normal n and the velocity
     u of the collider at the particle:
 
-        impulse p = max(0, -alpha g / dt - damping n . (v - u)),  alpha = `CONTACT_STIFFNESS`,   v += p n
-        friction: the tangential part of v - u becomes shorter by at most ``friction`` p
+        impulse p = max(0, -alpha g / dt - damping n . (v - u)),   alpha = `CONTACT_STIFFNESS`,   v += p n
+        friction q = t + alpha s / dt, shortened to at most ``friction`` p,                      v -= q
+
+    Here t is the tangential part of v - u, and s (m) the tangential displacement of the particle since it sticks: a
+    spring as stiff as that of the gap. Without it a particle that sticks would creep, because the transfer to the grid
+    moves it in every step. s is zero without contact. In slip it keeps the length at which the spring alone has the
+    force ``friction`` p.
 
     Attributes:
         shape: one of `SIZES`.

@@ -65,9 +65,10 @@ def obstacles(colliders: Sequence[Collider], times: Sequence[float], dtype: torc
 def contact_functions(dtype: torch.dtype) -> SimpleNamespace:
     """Functions `contact` and `contact_adjoint` for a precision.
 
-    ``contact(obstacles, pose, faces, dt, x, v, r)`` is the velocity of a particle at x with velocity v and radius r
-    after contact with the obstacles of row ``pose``. The first ``faces`` of them, 6 or none, are those of the unit
-    cube. ``contact_adjoint(..., g)`` takes the gradient g of the result to those of x and v.
+    ``contact(obstacles, pose, faces, dt, x, v, s, r)`` gives the velocity v and the tangential displacement s of a
+    particle at x of radius r after contact with the obstacles of row ``pose``, and whether it touches one. The first
+    ``faces`` obstacles, 6 or none, are those of the unit cube. ``contact_adjoint(..., g_v, g_s)`` takes gradients of
+    the results of a particle that touches to those of x, v and s.
     """
     real = {torch.float32: wp.float32, torch.float64: wp.float64}[dtype]
     vec3 = wp.types.vector(length=3, dtype=real)
@@ -75,13 +76,14 @@ def contact_functions(dtype: torch.dtype) -> SimpleNamespace:
 
     # One function, because Warp 1.19 leaves out the adjoint of a nested one that a forward function uses too.
     @wp.func
-    def touched(o: Obstacle, dt: real, x: vec3, v: vec3, r: real):
-        """Velocity after contact with one obstacle."""
+    def touched(o: Obstacle, dt: real, x: vec3, v: vec3, s: vec3, r: real):
+        """Velocity after contact with one obstacle, and displacement s after the step (see `Collider`)."""
         zero, one = real(0.0), real(1.0)
         arm = x - o.centre
         y = wp.transpose(o.axes) * arm
         # outward normal in the frame of the obstacle, and signed distance
-        normal, distance = vec3(zero, one, zero), y[1]
+        normal = vec3(zero, one, zero)
+        distance = y[1]
         if o.shape == wp.static(BOX):
             sign = vec3(
                 wp.where(y[0] < zero, -one, one),
@@ -94,41 +96,50 @@ def contact_functions(dtype: torch.dtype) -> SimpleNamespace:
                 distance = wp.length(beyond)
                 normal = wp.cw_mul(sign, beyond) / distance
             elif q[0] >= q[1] and q[0] >= q[2]:
-                normal, distance = vec3(sign[0], zero, zero), q[0]
+                normal = vec3(sign[0], zero, zero)
+                distance = q[0]
             elif q[1] >= q[2]:
-                normal, distance = vec3(zero, sign[1], zero), q[1]
+                normal = vec3(zero, sign[1], zero)
+                distance = q[1]
             else:
-                normal, distance = vec3(zero, zero, sign[2]), q[2]
+                normal = vec3(zero, zero, sign[2])
+                distance = q[2]
         elif o.shape != wp.static(PLANE):
-            along, radius = zero, o.size[0]
+            along = zero
+            radius = o.size[0]
             if o.shape == wp.static(CAPSULE):
-                along, radius = wp.clamp(y[1], -o.size[0], o.size[0]), o.size[1]
+                along = wp.clamp(y[1], -o.size[0], o.size[0])
+                radius = o.size[1]
             from_axis = vec3(y[0], y[1] - along, y[2])
             length = wp.length(from_axis)
             distance = length - radius
             if length > zero:
                 normal = from_axis / length
         gap = distance - r
-        result = v
+        after = v
+        stuck = s
         if gap < zero:
             n = o.axes * normal
             u = o.velocity + wp.cross(o.spin, arm)
-            impulse = -real(wp.static(CONTACT_STIFFNESS)) * gap / dt - o.damping * wp.dot(n, v - u)
+            stiffness = real(wp.static(CONTACT_STIFFNESS)) / dt
+            impulse = -stiffness * gap - o.damping * wp.dot(n, v - u)
             if impulse > zero:
-                after = v + impulse * n
-                slip = after - u
+                slip = v - u
                 slip = slip - wp.dot(slip, n) * n
-                speed = wp.length(slip)
-                limit = o.friction * impulse
-                if speed <= limit:
-                    result = after - slip
-                else:
-                    result = after - (limit / speed) * slip
-        return result
+                sticking = s - wp.dot(s, n) * n
+                friction = slip + stiffness * sticking
+                stuck = sticking + dt * slip
+                force, limit = wp.length(friction), o.friction * impulse
+                if force > limit:
+                    friction = (limit / force) * friction
+                    stuck = friction / stiffness
+                after = v + impulse * n - friction
+        return after, stuck
 
     @wp.func
-    def weighted(o: Obstacle, dt: real, x: vec3, v: vec3, r: real, g: vec3):
-        return wp.dot(touched(o, dt, x, v, r), g)
+    def weighted(o: Obstacle, dt: real, x: vec3, v: vec3, s: vec3, r: real, g_v: vec3, g_s: vec3):
+        after, stuck = touched(o, dt, x, v, s, r)
+        return wp.dot(after, g_v) + wp.dot(stuck, g_s)
 
     @wp.func
     def first_near(faces: wp.int32, x: vec3, r: real):
@@ -144,12 +155,21 @@ def contact_functions(dtype: torch.dtype) -> SimpleNamespace:
         dt: real,
         x: vec3,
         v: vec3,
+        s: vec3,
         r: real,
     ):
-        result = v
+        after = v  # one assignment each: several at once would alias v and s in Warp 1.19
+        stuck = s
+        touches = wp.int32(0)
         for k in range(first_near(faces, x, r), obstacles.shape[1]):
-            result = touched(obstacles[pose, k], dt, x, result, r)
-        return result
+            changed, moved = touched(obstacles[pose, k], dt, x, after, stuck, r)
+            if wp.length_sq(changed - after) > real(0.0):
+                touches = 1
+            after = changed
+            stuck = moved
+        if touches == 0:
+            stuck = vec3()
+        return after, stuck, touches
 
     @wp.func
     def contact_adjoint(
@@ -159,20 +179,28 @@ def contact_functions(dtype: torch.dtype) -> SimpleNamespace:
         dt: real,
         x: vec3,
         v: vec3,
+        s: vec3,
         r: real,
-        g: vec3,
+        g_after: vec3,
+        g_stuck: vec3,
     ):
-        first = first_near(faces, x, r)
+        first, last = first_near(faces, x, r), obstacles.shape[1] - 1
         g_x = vec3()
-        g_v = g
-        for reverse in range(first, obstacles.shape[1]):
-            last = first + obstacles.shape[1] - 1 - reverse
+        g_v = g_after
+        g_s = g_stuck
+        for done in range(last + 1 - first):
             before = v
-            for k in range(first, last):
-                before = touched(obstacles[pose, k], dt, x, before, r)
-            _o, _dt, by_x, by_v, _r, _g = wp.grad(weighted)(obstacles[pose, last], dt, x, before, r, g_v)
+            stuck = s
+            for k in range(first, last - done):
+                moved_v, moved_s = touched(obstacles[pose, k], dt, x, before, stuck, r)
+                before = moved_v
+                stuck = moved_s
+            _o, _dt, by_x, by_v, by_s, _r, _g, _h = wp.grad(weighted)(
+                obstacles[pose, last - done], dt, x, before, stuck, r, g_v, g_s
+            )
             g_x = g_x + by_x
             g_v = by_v
-        return g_x, g_v
+            g_s = by_s
+        return g_x, g_v, g_s
 
     return SimpleNamespace(contact=contact, contact_adjoint=contact_adjoint)

@@ -201,6 +201,7 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic", contact: bool =
         cached: wp.int32,
         sort: wp.int32,
         pose: wp.int32,
+        after: wp.int32,
         order: wp.array2d(dtype=wp.int32),
         x: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
@@ -210,6 +211,7 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic", contact: bool =
         vol0: wp.array(dtype=real),
         radius: wp.array(dtype=real),
         obstacles: wp.array2d(dtype=Obstacle),
+        stuck: wp.array2d(dtype=vec3),
         grid_rows: wp.array2d(dtype=mat34),
     ):
         """m_i += w_i m, (m v)_i += w_i (m v + A d_i) with A = m C - dt vol0 (4/dx^2) tau, d_i = x_i - x.
@@ -226,7 +228,10 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic", contact: bool =
         A = c.dx * (m * C[now, p] - (real(4.0) * c.dt * c.inv_dx * c.inv_dx * vol0[p]) * tau[cached, p])
         v_p = v[now, p]
         if wp.static(contact):
-            v_p = touch(obstacles, pose, c.faces, c.dt, x[now, p], v_p, radius[p])
+            v_p, stuck_p, _touches = touch(
+                obstacles, pose, c.faces, c.dt, x[now, p], v_p, stuck[now, p], radius[p]
+            )
+            stuck[after, p] = stuck_p
         # q = (m v + A d, m) grows by a column of A from node to node
         q0 = m * v_p - A * f
         q_i = vec4(q0[0], q0[1], q0[2], m)

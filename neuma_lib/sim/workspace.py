@@ -64,6 +64,8 @@ class Workspace:
         C, F: affine velocities [1/s] and elastic deformation gradients, shape (n_states, N, 3, 3).
         F_total: total deformation gradients, shape (n_states, N, 3, 3), if the state includes them.
         states: x, v, F, C and optionally F_total; grad_states: their gradients.
+        stuck: tangential displacements of particles in contact [m], shape (n_states, N, 3), see `Collider`.
+        carried: states, and `stuck` with contact of particles; grad_carried: their gradients.
         tau, F_trial: Kirchhoff stresses [Pa] and trial deformation gradients, shape (n_cached_steps, N, 3, 3).
         grid: momentum [kg m/s] and mass [kg] of the nodes, shape (n_cached_steps, copies * nodes^3, 4).
         grid_v: velocity [m/s] of the nodes and 1 where there is mass, shape (n_cached_steps, copies * nodes^3, 4).
@@ -97,13 +99,15 @@ class Workspace:
         if size.total:
             self.F_total = self._buffer((states, N), "mat33")
             self.states += (self.F_total,)
+        self.stuck = self._buffer((states, N) if self._contact else (1, 1), "vec3")
+        self.carried = (*self.states, self.stuck) if self._contact else self.states
         self.tau, self.F_trial = self._buffer((cached, N), "mat33"), self._buffer((cached, N), "mat33")
         self.grid, self.grid_v = self._buffer((cached, nodes), "vec4"), self._buffer((cached, nodes), "vec4")
         self.mass, self.vol0, self.radius = (self._buffer((N,), "real") for _ in range(3))
         self.obstacles = self._obstacles([0.0] * size.n_poses)
         self.faults = self._buffer((size.copies, 3), dtype=torch.int64)
         self.checkpoints = tuple(
-            value.new_empty(size.n_checkpoints, *value.shape[1:]) for value in self.states
+            value.new_empty(size.n_checkpoints, *value.shape[1:]) for value in self.carried
         )
         self.sorts = size.scatter != "atomic"
         n_sorts = -(-max(states - 1, 1) // SORT_EVERY) if self.sorts and size.differentiable else 1
@@ -120,6 +124,8 @@ class Workspace:
             if size.total:
                 self.grad_F_total = self._buffer((N,), "mat33")
                 self.grad_states += (self.grad_F_total,)
+            self.grad_stuck = self._buffer((N if self._contact else 1,), "vec3")
+            self.grad_carried = (*self.grad_states, self.grad_stuck)
             self.grad_grid = self._buffer((2, nodes), "vec4")
             self._record_adjoint()
 
@@ -196,7 +202,7 @@ class Workspace:
         """From tau and the state of a step to the velocities of the nodes."""
         cached = self.cached_at(step)
         self.grid[cached].zero_()
-        _run(self._p2g, self.at(step), cached, self.sorted_at(step), self.pose_at(step))
+        _run(self._p2g, self.at(step), cached, self.sorted_at(step), self.pose_at(step), self.at(step + 1))
         _run(self._grid_update, cached)
 
     def transfer_to_particles(self, step: int) -> None:
@@ -293,8 +299,8 @@ class Workspace:
         if self.sorts:
             self._cells = self._record(k.cells, N, 0, self.x, self.cells)
         self._p2g = self._record(
-            k.p2g, self._scattering_threads, 0, 0, 0, 0, self.order,
-            self.x, self.v, self.C, self.tau, self.mass, self.vol0, self.radius, self.obstacles, rows,
+            k.p2g, self._scattering_threads, 0, 0, 0, 0, 0, self.order,
+            self.x, self.v, self.C, self.tau, self.mass, self.vol0, self.radius, self.obstacles, self.stuck, rows,
         )  # fmt: skip
         self._grid_update = self._record(k.grid_update, nodes, 0, self.grid, self.grid_v)
         self._g2p = self._record(
@@ -318,8 +324,8 @@ class Workspace:
         self._grid_adjoint = self._record(k.grid_adjoint, nodes, 0, 0, self.grid, self.grad_grid)
         self._p2g_adjoint = self._record(
             k.p2g_adjoint, N, 0, 0, 0, 0,
-            self.x, self.v, self.C, self.tau, self.mass, self.vol0, self.radius, self.obstacles, grad_rows,
-            self.grad_x, self.grad_v, self.grad_C, self.grad_tau,
+            self.x, self.v, self.C, self.tau, self.mass, self.vol0, self.radius, self.obstacles, self.stuck, grad_rows,
+            self.grad_x, self.grad_v, self.grad_C, self.grad_tau, self.grad_stuck,
         )  # fmt: skip
         if self.size.total:
             self._total_adjoint = self._record(

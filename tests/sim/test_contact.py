@@ -174,9 +174,7 @@ def test_a_block_on_an_inclined_plane(friction, angle):
     """It slides with g (sin a - mu cos a), and stays if mu > tan a.
 
     Gravity is inclined instead of the plane. The block starts at rest on the plane and rings for some milliseconds,
-    which changes the normal force but not its mean. It is stiff, so that it shears little. Friction stops the particles
-    that touch before a transfer. In each step the weight of the n layers moves them again, by n g sin(a) dt if they
-    have a node for themselves, so that a block that stays creeps at about this speed.
+    which changes the normal force but not its mean. It is stiff, so that it shears little.
     """
     a = math.radians(angle)
     side, dt = 0.2, 2e-4
@@ -192,8 +190,7 @@ def test_a_block_on_an_inclined_plane(friction, angle):
     expected = GRAVITY * max(0.0, math.sin(a) - friction * math.cos(a))
     assert abs(measured - expected) < 0.03 * GRAVITY
     if expected == 0:
-        creep = 8 * GRAVITY * math.sin(a) * dt
-        assert float(speed[1]) < 3 * creep < 0.05 * GRAVITY * math.sin(a) * dt * steps[1]
+        assert abs(float(path.x[1, :, 0].mean() - path.x[0, :, 0].mean())) < 1e-3
 
 
 def test_momenta_change_by_the_impulse_on_the_collider():
@@ -201,13 +198,15 @@ def test_momenta_change_by_the_impulse_on_the_collider():
 
     The transfer conserves both, except for the moment of the stress of the affine velocities, which is symmetric here.
     """
-    model, start = falling_on(COLLIDERS["moving"])
+    model, start = falling_on(replace(COLLIDERS["moving"], friction=0.0))
+    model = replace(model, colliders=model.colliders[:1])
     law = make_law("fixed_corotated")
     path = rollout(model, law, start, steps=41, frames=(40, 41))
     before = State(path.x[0], path.v[0], start.mass, start.vol0, path.F[0], path.C[0])
-    v = before.v
-    for collider in model.obstacles:
-        v = torch_simulation.touched(collider, before.x, v, contact_radius(before.vol0), DT, 40 * DT)
+    # The law of friction depends on the displacement since first contact, which no state holds: no friction here.
+    v, _ = torch_simulation.contact(
+        model, before.x, before.v, torch.zeros_like(before.x), before.vol0, 40 * DT
+    )
     impulse = start.mass[:, None] * (v - before.v)
     assert impulse.norm() > 1e-3 * linear_momentum(start.mass, before.v).norm()
     weight = start.mass.sum() * DT * torch.tensor(model.gravity, dtype=torch.float64)
