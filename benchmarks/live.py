@@ -112,7 +112,7 @@ def main() -> None:
         ),
         "and particles by stress": lambda s: scalars.von_mises(law, s.F.to(device)),
     }
-    constants = {"grid": model.grid, "boundary": model.boundary, "walls": model.walls}
+    constants = {"grid": model.grid, "boundary": model.boundary, "contact": model.contact}
     print(
         f"{len(body.x0)} particles, {len(g)} Gaussians, {model.grid}^3 grid, step {1e3 * model.dt:g} ms, "
         f"{chosen.law} law, {device_name(device)}"

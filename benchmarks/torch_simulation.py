@@ -2,13 +2,20 @@
 
 import torch
 
+from neuma_lib.sim.colliders import CONTACT_STIFFNESS, contact_radius
 from neuma_lib.sim.model import as_regions
 
 
-def step(model, bodies, x, v, F, C, mass, vol0):
-    """One step of the paper's Algorithm 2 with all 27 nodes of a particle as one axis."""
+def step(model, bodies, x, v, F, C, stuck, mass, vol0, time=0.0):
+    """One step of the paper's Algorithm 2 with all 27 nodes of a particle as one axis.
+
+    Args:
+        stuck: tangential displacements of particles in contact [m], shape (N, 3).
+        time: of the step [s], for moving colliders.
+    """
     n, dx, dt = model.nodes, model.dx, model.dt
     tau = evaluate(bodies, "elasticity", F)
+    v, stuck = contact(model, x, v, stuck, vol0, time)
     cells = x / dx - model.first_node
     base = (cells.detach() - 0.5).int()
     f = cells - base
@@ -36,7 +43,37 @@ def step(model, bodies, x, v, F, C, mass, vol0):
     if model.clamps:
         x = x.clamp(*model.stencil_range)
     F = evaluate(bodies, "plasticity", F + dt * C @ F)
-    return x, v, F, C
+    return x, v, F, C, stuck
+
+
+def contact(model, x, v, stuck, vol0, time):
+    """Velocities after contact with all colliders, and tangential displacements, see `Collider`."""
+    touches = torch.zeros_like(x[:, 0], dtype=torch.bool)
+    for collider in model.obstacles:
+        v, stuck, here = touched(collider, x, v, stuck, contact_radius(vol0), model.dt, time)
+        touches = touches | here
+    return v, torch.where(touches[:, None], stuck, 0.0)
+
+
+def touched(collider, x, v, stuck, radius, dt, time):
+    """The same of one collider, and which particles touch it."""
+    distance, n = collider.surface(x, time)
+    u, gap = collider.velocity_at(x, time), distance - radius
+    impulse = -CONTACT_STIFFNESS * gap / dt - collider.damping * (n * (v - u)).sum(1)
+    touches = ((gap < 0) & (impulse > 0))[:, None]
+
+    def tangential(a):
+        return a - (n * a).sum(1, keepdim=True) * n
+
+    slip, sticking = tangential(v - u), tangential(stuck)
+    friction = slip + CONTACT_STIFFNESS / dt * sticking
+    limit = (min(collider.friction, 1e12) * impulse)[:, None]
+    force = torch.where(touches, friction, 1.0).norm(dim=1, keepdim=True)
+    slides = force > limit
+    limited = torch.where(slides, limit / force * friction, friction)
+    moved = torch.where(slides, limited * dt / CONTACT_STIFFNESS, sticking + dt * slip)
+    after = v + impulse[:, None] * n - limited
+    return torch.where(touches, after, v), torch.where(touches, moved, stuck), touches[:, 0]
 
 
 def walls(model, grid_v):
@@ -72,12 +109,12 @@ def rollout(model, law, state, frames, total=False):
     Each has the shape (T, N, ...).
     """
     bodies = as_regions(law, len(state.x))
-    now, seen = state.motion, []
+    now, stuck, seen = state.motion, torch.zeros_like(state.x), []
     F_total = (state.F,) if total else ()
     for n in range(frames[-1] + 1):
         if n in frames:
             seen.append((*now, *F_total))
         if n < frames[-1]:
-            now = step(model, bodies, *now, state.mass, state.vol0)
+            *now, stuck = step(model, bodies, *now, stuck, state.mass, state.vol0, n * model.dt)
             F_total = tuple(F + model.dt * now[3] @ F for F in F_total)
     return tuple(torch.stack(values) for values in zip(*seen, strict=True))

@@ -35,8 +35,8 @@ class SimulationConfig(Section):
     boundary: Annotated[str | dict[str, str], AfterValidator(_conditions)] = Field(
         "no_slip", description="condition of all walls, no_slip, slip or sticky, or of each wall (x_min, ...)"
     )
-    walls: Literal["outside", "released"] = Field(
-        "outside",
-        description="wall nodes outside the cube, so that bodies rest at y = 0; or inside, with clamped particles, as "
-        "in the authors' released code",
+    contact: Literal["particles", "nodes", "released"] = Field(
+        "nodes",
+        description="contact of particles with the faces of the cube; wall nodes outside the cube, so that bodies rest "
+        "near y = 0; or wall nodes inside, with clamped particles, as in the authors' released code",
     )

@@ -30,9 +30,13 @@ def spread_frames(count: int, limit: int) -> list[int]:
     return np.unique(np.linspace(0, count - 1, min(count, limit)).round().astype(int)).tolist()
 
 
-def first_contact(model: MPM, x: Tensor) -> int:
-    """Index of the first frame of positions x (T, N, 3) [m] with a particle in contact with a wall, T if none."""
-    touching = contact_clearance(model, x) <= 0
+def first_contact(model: MPM, x: Tensor, vol0: Tensor, steps: Sequence[int] = (0,)) -> int:
+    """Index of the first frame of positions x (T, N, 3) [m] with a particle in contact, T if none.
+
+    Args:
+        vol0, steps: as for `contact_clearance`.
+    """
+    touching = contact_clearance(model, x, vol0, steps) <= 0
     return int(touching.int().argmax()) if bool(touching.any()) else len(x)
 
 
@@ -75,7 +79,7 @@ def _touches(model: MPM, start: State, n: int) -> bool:
         + n * model.dt * velocity
         + model.dt**2 * n * (n + 1) / 2 * gravity
     )
-    return float(contact_clearance(model, x)) <= 0
+    return float(contact_clearance(model, x, start.vol0, (n,))) <= 0
 
 
 def held_out_frames(count: int, share: float, blocks: int = 1, contact: int = 0) -> list[int]:

@@ -143,8 +143,10 @@ def train_structured(
         raise NonFiniteError("material", "the simulation with the uncorrected law diverges")
     paths = [path for path, _ in simulated]
     firsts = [
-        first_informative_frame(len(loss.frames), first_contact(model, path.at(loss.frames).x))
-        for (_, loss), path in zip(videos, paths, strict=True)
+        first_informative_frame(
+            len(loss.frames), first_contact(model, path.at(loss.frames).x, own.vol0, loss.frames)
+        )
+        for (own, loss), path in zip(videos, paths, strict=True)
     ]
     informative = [from_frame(*video, path, k) for video, path, k in zip(videos, paths, firsts, strict=True)]
     held_out = [

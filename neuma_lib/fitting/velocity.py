@@ -157,7 +157,7 @@ def estimate_velocity(
     if len(frames) < 2:
         raise InputError("frames", f"{len(frames)} of the training view before contact must be at least 2")
     videos, law = tuple(video.to(precision) for video in videos), copy.deepcopy(law).to(precision)
-    if float(contact_clearance(model, body.x0)) <= 0:
+    if float(contact_clearance(model, body.x0, body.vol0)) <= 0:
         raise InputError(
             "frames", "the body touches a wall in the first frame", "Start the video before the contact"
         )
@@ -234,7 +234,7 @@ class _Flight:
         box = torch.stack([body.x0.amin(dim=0), body.x0.amax(dim=0)])
         self._to_middle = 0.5 - box.mean(dim=0)
         self._in_middle = replace(body, x0=body.x0 + self._to_middle)
-        self._weightless = replace(model, gravity=(0.0, 0.0, 0.0))
+        self._weightless = replace(model, gravity=(0.0, 0.0, 0.0), colliders=())
         self._near, self._path = torch.zeros_like(self.centre), None
 
     def motion(self, unknowns: np.ndarray) -> tuple[Tensor, Tensor]:
@@ -288,7 +288,7 @@ class _Flight:
     def frames_before_contact(self, unknowns: np.ndarray, count: int) -> int:
         """Number of the first `count` frames that end before the body touches a wall."""
         x, _ = self(*self.motion(unknowns), self.ends[:count])
-        touching = contact_clearance(self.model, x) <= 0
+        touching = contact_clearance(self.model, x, self.body.vol0, self.ends[:count]) <= 0
         return int(touching.int().argmax()) if touching.any() else len(x)
 
 

@@ -129,7 +129,8 @@ class VideoResiduals:
         """Hold out the last share of the frames after the first contact, whose time is the same for any law."""
         law = family.law_spec(family.values(family.unbounded(family.guess), self.model, self.density))
         (path,) = self._paths([Candidate(law, np.zeros(NUISANCES))], len(self.frames), self._body[0])
-        contact = 0 if path is None else first_contact(self.model, path.at(self.frames).x)
+        vol0 = self._body[0].vol0
+        contact = 0 if path is None else first_contact(self.model, path.at(self.frames).x, vol0, self.frames)
         self.fitted = held_out_frames(len(self.frames), share, contact=contact)[0]
 
     def residuals(self, candidates: Sequence[Candidate], count: int) -> list[list[Tensor] | None]:

@@ -12,6 +12,7 @@ RENAMED = {
     "material": "training",
     "scenes.*.material": "scenes.*.training",
     "simulation.particles": "geometry.particles",
+    "simulation.walls": "simulation.contact",
     "dataset.sub_frames": "dataset.exposure_samples",
     "identify.particles": "identify.refined_particles",
     "identify.misplaced": "identify.pose_tolerance",

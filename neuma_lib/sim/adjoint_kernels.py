@@ -12,22 +12,25 @@ from types import SimpleNamespace
 import torch
 import warp as wp
 
+from neuma_lib.sim.contact_kernels import contact_functions, obstacle_type
 from neuma_lib.sim.gather import gather_functions
 from neuma_lib.sim.kernels import grid_functions, warp_types
 from neuma_lib.sim.scatter import scatter_functions
 
 
 @functools.cache
-def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamespace:
-    """Kernels `g2p_adjoint`, `grid_adjoint`, `p2g_adjoint` and `total_adjoint` for a precision and a scatter method."""
+def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic", contact: bool = False) -> SimpleNamespace:
+    """Kernels `g2p_adjoint`, `grid_adjoint`, `p2g_adjoint` and `total_adjoint`, see `kernels.forward_kernels`."""
     t, functions = warp_types(dtype), grid_functions(dtype)
+    Obstacle, touching = obstacle_type(dtype), contact_functions(dtype)
+    touch, touch_adjoint = touching.contact, touching.contact_adjoint
     ordered = scatter != "atomic"
     run_of, deposit = scatter_functions(dtype, scatter, 3)
     real, vec3, vec4, mat33, mat34, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.mat34, t.GridConstants
     stencil, slopes, moments = functions.stencil, functions.slopes, functions.moments
     column, wall_mask, moved_mask = functions.column, functions.wall_mask, functions.moved_mask
     gather, three_nodes = gather_functions(dtype)
-    module = f"neuma_lib.sim.adjoint_{str(dtype).removeprefix('torch.')}_{scatter}"
+    module = f"neuma_lib.sim.adjoint_{str(dtype).removeprefix('torch.')}_{scatter}{'_contact' * contact}"
     kernel = functools.partial(wp.kernel, enable_backward=False, module=module)
 
     @kernel
@@ -114,17 +117,22 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         now: wp.int32,
         cached: wp.int32,
         side: wp.int32,
+        pose: wp.int32,
         x: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
         C: wp.array2d(dtype=mat33),
         tau: wp.array2d(dtype=mat33),
         mass: wp.array(dtype=real),
         vol0: wp.array(dtype=real),
+        radius: wp.array(dtype=real),
+        obstacles: wp.array2d(dtype=Obstacle),
+        stuck: wp.array2d(dtype=vec3),
         grad_grid_rows: wp.array2d(dtype=mat34),
         grad_x: wp.array(dtype=vec3),
         grad_v: wp.array(dtype=vec3),
         grad_C: wp.array(dtype=mat33),
         grad_tau: wp.array(dtype=mat33),
+        grad_stuck: wp.array(dtype=vec3),
     ):
         """From gradients of momentum and mass of the nodes to those of x (added), v, C and tau (set)."""
         p = wp.tid()
@@ -135,7 +143,12 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         m = mass[p]
         stress = real(4.0) * c.dt * c.inv_dx * c.inv_dx * vol0[p]
         A = c.dx * (m * C[now, p] - stress * tau[cached, p])
-        q0 = m * v[now, p] - A * f
+        v_p = v[now, p]
+        if wp.static(contact):
+            v_p, _stuck, touches = touch(
+                obstacles, pose, c.faces, c.dt, x[now, p], v_p, stuck[now, p], radius[p]
+            )
+        q0 = m * v_p - A * f
         q_i = vec4(q0[0], q0[1], q0[2], m)
         step_k = vec3(real(0.0), real(1.0), real(2.0))
         # rows: sum w g, then the columns of G = sum w g d^T / dx
@@ -152,7 +165,26 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
             q_i += column(A, 0)
         g = vec3(S[0, 0], S[0, 1], S[0, 2])
         g_A = c.dx * mat33(S[1, 0], S[2, 0], S[3, 0], S[1, 1], S[2, 1], S[3, 1], S[1, 2], S[2, 2], S[3, 2])
-        grad_v[p] = m * g
+        g_v = m * g
+        if wp.static(contact):
+            g_s = vec3()
+            if touches > 0:
+                g_x, g_v_before, g_s = touch_adjoint(
+                    obstacles,
+                    pose,
+                    c.faces,
+                    c.dt,
+                    x[now, p],
+                    v[now, p],
+                    stuck[now, p],
+                    radius[p],
+                    g_v,
+                    grad_stuck[p],
+                )
+                grad_x[p] = grad_x[p] + g_x
+                g_v = g_v_before
+            grad_stuck[p] = g_s
+        grad_v[p] = g_v
         grad_C[p] = m * g_A
         grad_tau[p] = -stress * g_A
         grad_x[p] = grad_x[p] + c.inv_dx * (moving - wp.transpose(A) * g)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -29,20 +30,42 @@ def free_flight_steps(
             return 0
         if not (F == torch.eye(3, dtype=F.dtype, device=F.device)).all() or C.any():
             return 0
-        clear = _clear_of_walls(model, x.unflatten(0, (copies, -1)), v[:, :1], last)
+        clear = _clear_steps(model, x.unflatten(0, (copies, -1)), v[:, :1], state.vol0.max(), last)
         if clear and not all(_at_rest(model, region, state, len(x) // copies) for region in regions):
             return 0
     return clear
 
 
-def _clear_of_walls(model: MPM, x0: Tensor, v0: Tensor, last: int) -> int:
-    """Number of leading ballistic steps in which no particle of x0 (copies, N, 3) is in reach of a wall."""
-    box = torch.stack([x0.amin(dim=1), x0.amax(dim=1)], dim=1).double().cpu()
-    n = torch.arange(last, dtype=torch.float64)[:, None, None, None]
+def _clear_steps(model: MPM, x0: Tensor, v0: Tensor, vol0: Tensor, last: int) -> int:
+    """Number of leading ballistic steps in which no particle of x0 (copies, N, 3) is in contact.
+
+    Args:
+        v0: velocities of the copies [m/s], shape (copies, 1, 3).
+        vol0: largest volume of a particle [m^3].
+    """
+    x0, v0, vol0 = x0.double().cpu(), v0.double().cpu(), vol0.double().cpu().reshape(1)
     gravity = torch.tensor(model.gravity, dtype=torch.float64)
-    box = box + n * model.dt * v0.double().cpu() + model.dt**2 * n * (n + 1) / 2 * gravity
-    touching = (contact_clearance(model, box) <= _MARGIN * model.dx).any(dim=1)
-    return int(touching.int().argmax()) if touching.any() else last
+
+    def flown(x: Tensor, n: Tensor | int) -> Tensor:
+        return x + n * model.dt * v0 + model.dt**2 * n * (n + 1) / 2 * gravity
+
+    box = torch.stack([x0.amin(dim=1), x0.amax(dim=1)], dim=1)
+    steps = torch.arange(last, dtype=torch.float64)[:, None, None, None]
+    walls = replace(model, colliders=())
+    touching = (contact_clearance(walls, flown(box, steps), vol0) <= _MARGIN * model.dx).any(dim=1)
+    clear = int(touching.int().argmax()) if touching.any() else last
+    n = 0
+    while (
+        model.colliders and n < clear
+    ):  # as many steps at once as no particle can need to the nearest collider
+        distance = float(contact_clearance(model, flown(x0, n), vol0, (n,)).min()) - _MARGIN * model.dx
+        if distance <= 0:
+            return n
+        fastest = float(v0.norm(dim=-1).max() + clear * model.dt * gravity.norm()) + max(
+            collider.fastest for collider in model.colliders
+        )
+        n += max(1, int(distance / (fastest * model.dt))) if fastest else clear
+    return clear
 
 
 def _at_rest(model: MPM, region: MaterialRegion, state: State, copy: int) -> bool:

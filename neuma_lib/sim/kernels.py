@@ -25,6 +25,7 @@ import torch
 import warp as wp
 
 from neuma_lib.device import start_warp
+from neuma_lib.sim.contact_kernels import contact_functions, obstacle_type
 from neuma_lib.sim.gather import gather_functions
 from neuma_lib.sim.scatter import scatter_functions
 
@@ -55,6 +56,7 @@ def warp_types(dtype: torch.dtype) -> SimpleNamespace:
         n: wp.int32  # nodes along an edge
         particles: wp.int32  # per copy
         wall_nodes: wp.int32  # thickness of a wall
+        faces: wp.int32  # first obstacles that are faces of the unit cube
         walls: types.walls  # condition on x_min, x_max, y_min, y_max, z_min, z_max
         first: real  # coordinate of node 0 [dx]
         dx: real  # node spacing [m]
@@ -171,17 +173,18 @@ def grid_functions(dtype: torch.dtype) -> SimpleNamespace:
 
 
 @functools.cache
-def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamespace:
-    """Kernels `cells`, `p2g`, `grid_update`, `g2p`, `trial_deformation` and `advect_tracers` for a precision and a
-    scatter method."""
+def forward_kernels(dtype: torch.dtype, scatter: str = "atomic", contact: bool = False) -> SimpleNamespace:
+    """Kernels `cells`, `p2g`, `grid_update`, `g2p`, `trial_deformation` and `advect_tracers` for a precision, a
+    scatter method, and with or without contact of particles."""
     t, functions = warp_types(dtype), grid_functions(dtype)
+    Obstacle, touch = obstacle_type(dtype), contact_functions(dtype).contact
     ordered = scatter != "atomic"
     run_of, deposit = scatter_functions(dtype, scatter, 4)
     real, vec3, vec4, mat33, mat34, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.mat34, t.GridConstants
     copy_of, stencil, moments = functions.copy_of, functions.stencil, functions.moments
     column, wall_mask, moved = functions.column, functions.wall_mask, functions.moved
     gather, _ = gather_functions(dtype)
-    module = f"neuma_lib.sim.forward_{str(dtype).removeprefix('torch.')}_{scatter}"
+    module = f"neuma_lib.sim.forward_{str(dtype).removeprefix('torch.')}_{scatter}{'_contact' * contact}"
     kernel = functools.partial(wp.kernel, enable_backward=False, module=module)
 
     @kernel
@@ -197,6 +200,8 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         now: wp.int32,
         cached: wp.int32,
         sort: wp.int32,
+        pose: wp.int32,
+        after: wp.int32,
         order: wp.array2d(dtype=wp.int32),
         x: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
@@ -204,9 +209,15 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         tau: wp.array2d(dtype=mat33),
         mass: wp.array(dtype=real),
         vol0: wp.array(dtype=real),
+        radius: wp.array(dtype=real),
+        obstacles: wp.array2d(dtype=Obstacle),
+        stuck: wp.array2d(dtype=vec3),
         grid_rows: wp.array2d(dtype=mat34),
     ):
-        """m_i += w_i m, (m v)_i += w_i (m v + A d_i) with A = m C - dt vol0 (4/dx^2) tau, d_i = x_i - x."""
+        """m_i += w_i m, (m v)_i += w_i (m v + A d_i) with A = m C - dt vol0 (4/dx^2) tau, d_i = x_i - x.
+
+        v is the velocity after contact of particles.
+        """
         p = wp.tid()
         alive = p < mass.shape[0]
         if wp.static(ordered):
@@ -215,8 +226,14 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         run = run_of(wp.where(alive, first, -1))
         m = mass[p]
         A = c.dx * (m * C[now, p] - (real(4.0) * c.dt * c.inv_dx * c.inv_dx * vol0[p]) * tau[cached, p])
+        v_p = v[now, p]
+        if wp.static(contact):
+            v_p, stuck_p, _touches = touch(
+                obstacles, pose, c.faces, c.dt, x[now, p], v_p, stuck[now, p], radius[p]
+            )
+            stuck[after, p] = stuck_p
         # q = (m v + A d, m) grows by a column of A from node to node
-        q0 = m * v[now, p] - A * f
+        q0 = m * v_p - A * f
         q_i = vec4(q0[0], q0[1], q0[2], m)
         slope_k = wp.outer(wp.cw_mul(wk, vec3(real(0.0), real(1.0), real(2.0))), column(A, 2))
         for i in range(3):

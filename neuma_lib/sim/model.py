@@ -13,30 +13,33 @@ from torch import Tensor
 from neuma_lib.errors import InputError
 from neuma_lib.mechanics.catalogue import COURANT_LIMIT
 from neuma_lib.mechanics.law import Law, Weights
+from neuma_lib.sim.colliders import Collider, contact_radius, unit_cube
 
 WALLS = ("x_min", "x_max", "y_min", "y_max", "z_min", "z_max")
 CONDITIONS = ("no_slip", "slip", "sticky")
-FORMS = ("outside", "released")
+CONTACTS = ("particles", "nodes", "released")
+_FRICTION = {"no_slip": math.inf, "slip": 0.0}
 _OUTSIDE = 2
-"""Nodes outside the cube at either end of an axis, all of them wall nodes, for "outside" walls."""
+"""Nodes outside the cube at either end of an axis, wall nodes if ``contact`` is "nodes"."""
 
 
 @dataclass(frozen=True)
 class MPM:
     """Constants of the material point method on the unit cube.
 
-    Nodes lie at integer multiples of dx = 1 / grid. A particle interacts with a wall if its stencil of three nodes per
-    axis contains a wall node, i.e. within 1.5 dx of one. It stops half a cell behind the first wall node, where the
-    stencil contains wall nodes only. There are two forms of walls:
+    Nodes lie at integer multiples of dx = 1 / grid. Bodies touch the faces of the cube and other obstacles in one of
+    three ways:
 
-    - "outside": the first wall nodes are one cell outside the cube, at -dx and 1 + dx, with a second one behind each to
-      complete the stencil of every reachable position. Contact starts half a cell inside the cube. A body rests with
-      its lowest particles within 0.4 cells of y = 0, soft bodies below it and stiff ones above. Particles move only by
-      their velocity.
-    - "released": as in the authors' code. Nodes are 0 ... grid - 1, of which the first and last ``wall_cells`` are
-      walls. Contact starts ``wall_cells + 0.5`` cells inside the cube (one more at the far end), and positions are
-      clamped to where the stencil exists, 0.5 dx to 1 - 1.5 dx. With one wall cell the clamp permanently creases soft
-      bodies, because it does not change their deformation gradients.
+    - "particles": contact changes the velocities of the particles that penetrate a collider (`colliders.Collider`).
+      It starts where the surface of the body touches.
+    - "nodes": nodes outside the cube stop. The first are one cell outside, at -dx and 1 + dx, with a second one behind
+      each to complete the stencil of every reachable position. A particle interacts with a wall if its stencil of three
+      nodes per axis contains a wall node, so contact starts half a cell inside the cube. A body rests with its lowest
+      particles within 0.4 cells of y = 0, soft bodies below it and stiff ones above.
+    - "released": as in the authors' code. Nodes are 0 ... grid - 1, of which the first and last ``wall_cells`` stop.
+      Contact starts ``wall_cells + 0.5`` cells inside the cube (one more at the far end), and positions are clamped to
+      where the stencil exists, 0.5 dx to 1 - 1.5 dx. With one wall cell the clamp permanently creases soft bodies,
+      because it does not change their deformation gradients.
 
     Attributes:
         grid: cells along an edge of the cube.
@@ -44,9 +47,11 @@ class MPM:
         gravity: acceleration [m/s^2], y is up.
         boundary: boundary condition, one name for all walls or one per wall (keys `WALLS`, default "no_slip").
             "no_slip" stops a wall node whose velocity points into the wall, "slip" removes only the component that
-            points into the wall, "sticky" always stops wall nodes.
-        walls: form of the walls, one of `FORMS`.
+            points into the wall, "sticky" always stops wall nodes. For contact of particles, "no_slip" is infinite
+            friction and "slip" is none; "sticky" is not available.
+        contact: one of `CONTACTS`.
         wall_cells: thickness of released walls [nodes].
+        colliders: obstacles in the cube, for contact of particles only.
 
     Raises:
         InputError: a value is out of range or unknown.
@@ -56,8 +61,9 @@ class MPM:
     dt: float
     gravity: tuple[float, float, float] = (0.0, -9.8, 0.0)
     boundary: str | Mapping[str, str] | tuple[str, ...] = "no_slip"
-    walls: str = "outside"
+    contact: str = "nodes"
     wall_cells: int = 1
+    colliders: tuple[Collider, ...] = ()
 
     def __post_init__(self):
         if not isinstance(self.grid, int) or self.grid < 6:
@@ -67,14 +73,26 @@ class MPM:
         gravity = tuple(float(g) for g in self.gravity)
         if len(gravity) != 3 or not all(math.isfinite(g) for g in gravity):
             raise InputError("gravity", f"{self.gravity!r} must be three finite accelerations [m/s^2]")
-        if self.walls not in FORMS:
-            raise InputError("walls", f"{self.walls!r} must be one of {', '.join(FORMS)}")
-        largest = (self.grid - 4) // 2 if self.walls == "released" else 1
+        if self.contact not in CONTACTS:
+            raise InputError("contact", f"{self.contact!r} must be one of {', '.join(CONTACTS)}")
+        largest = (self.grid - 4) // 2 if self.contact == "released" else 1
         if not isinstance(self.wall_cells, int) or not 1 <= self.wall_cells <= largest:
-            limits = f"1 to {largest} for {self.walls} walls and {self.grid} cells"
+            limits = f"1 to {largest} for contact of {self.contact} and {self.grid} cells"
             raise InputError("wall_cells", f"{self.wall_cells!r} must be an integer from {limits}")
         object.__setattr__(self, "gravity", gravity)
         object.__setattr__(self, "boundary", _six_conditions(self.boundary))
+        object.__setattr__(self, "colliders", tuple(self.colliders))
+        if self.contact != "particles" and self.colliders:
+            raise InputError("colliders", f"need contact of particles, not of {self.contact}")
+        if self.contact == "particles" and "sticky" in self.boundary:
+            raise InputError("boundary", "'sticky' needs contact of nodes", "Use no_slip or slip")
+
+    @property
+    def obstacles(self) -> tuple[Collider, ...]:
+        """Colliders of contact of particles: the six faces of the cube in the order of `WALLS`, then the others."""
+        if self.contact != "particles":
+            return ()
+        return (*unit_cube([_FRICTION[condition] for condition in self.boundary]), *self.colliders)
 
     @property
     def dx(self) -> float:
@@ -84,34 +102,36 @@ class MPM:
     @property
     def clamps(self) -> bool:
         """Whether positions are clamped to where their stencil exists."""
-        return self.walls == "released"
+        return self.contact == "released"
 
     @property
     def wall_nodes(self) -> int:
         """Wall nodes at either end of an axis."""
-        return self.wall_cells if self.walls == "released" else _OUTSIDE
+        return {"particles": 0, "nodes": _OUTSIDE, "released": self.wall_cells}[self.contact]
 
     @property
     def first_node(self) -> int:
         """Coordinate of the first node of an axis [dx]."""
-        return 0 if self.walls == "released" else -_OUTSIDE
+        return 0 if self.contact == "released" else -_OUTSIDE
 
     @property
     def nodes(self) -> int:
         """Nodes along an edge of the grid."""
-        return self.grid if self.walls == "released" else self.grid + 1 + 2 * _OUTSIDE
+        return self.grid if self.contact == "released" else self.grid + 1 + 2 * _OUTSIDE
 
     @property
     def stencil_range(self) -> tuple[float, float]:
         """Closed interval of coordinates at which the stencil exists [m]."""
-        if self.walls == "released":
+        if self.contact == "released":
             return 0.5 * self.dx, 1.0 - 1.5 * self.dx
         return (0.5 - _OUTSIDE) * self.dx, 1.0 + (_OUTSIDE - 0.5) * self.dx
 
     @property
     def free_range(self) -> tuple[float, float]:
-        """Open interval of coordinates without wall nodes in the stencil [m]."""
-        if self.walls == "released":
+        """Open interval of coordinates without wall nodes in the stencil, or in the cube without radii [m]."""
+        if self.contact == "particles":
+            return 0.0, 1.0
+        if self.contact == "released":
             return (self.wall_cells + 0.5) * self.dx, 1.0 - (self.wall_cells + 1.5) * self.dx
         return 0.5 * self.dx, 1.0 - 0.5 * self.dx
 
@@ -176,10 +196,26 @@ def consecutive(laws: Sequence[Law], counts: Sequence[int]) -> tuple[MaterialReg
     return tuple(MaterialRegion(law, end - n, end) for law, n, end in zip(laws, counts, ends, strict=True))
 
 
-def contact_clearance(model: MPM, x: Tensor) -> Tensor:
-    """Smallest distance [m] of particles x (..., N, 3) to the contact zone of the walls, <= 0 in contact."""
+def contact_clearance(model: MPM, x: Tensor, vol0: Tensor, steps: Sequence[int] = (0,)) -> Tensor:
+    """Smallest distance [m] to the contact zones of walls and colliders, <= 0 in contact, shape (T, ...).
+
+    Args:
+        x: positions [m], shape (T, ..., N, 3), or (..., N, 3) for one step.
+        vol0: initial volumes of the particles [m^3], shape (N,) or (..., N).
+        steps: time steps of the T states, which matter if colliders move.
+    """
     low, high = model.free_range
-    return torch.minimum(x - low, high - x).amin(dim=(-2, -1))
+    nearest = torch.minimum(x - low, high - x).amin(dim=-1)
+    if model.contact != "particles":
+        return nearest.amin(dim=-1)
+    for collider in model.colliders:
+        if collider.moves and len(steps) > 1:
+            far = [collider.surface(own, n * model.dt)[0] for own, n in zip(x, steps, strict=True)]
+            distance = torch.stack(far)
+        else:
+            distance, _ = collider.surface(x, steps[0] * model.dt)
+        nearest = torch.minimum(nearest, distance)
+    return (nearest - contact_radius(vol0)).amin(dim=-1)
 
 
 def _six_conditions(boundary: str | Mapping[str, str] | Sequence[str]) -> tuple[str, ...]:

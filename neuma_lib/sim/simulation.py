@@ -78,6 +78,8 @@ class Simulation:
         x = state.x
         scatter = scatter or scatter_for(x.device, x.dtype)
         size = WorkspaceSize(model, len(x), x.dtype, x.device, total=total, copies=copies, scatter=scatter)
+        if any(collider.moves for collider in model.colliders):
+            size = size._replace(n_poses=steps + 1)
         if plan:
             size = size._replace(
                 n_states=plan.segment + 1,
@@ -86,8 +88,7 @@ class Simulation:
                 differentiable=True,
             )
         self.workspace = pooled_workspace(size, user=self)
-        self.workspace.mass.copy_(state.mass.detach())
-        self.workspace.vol0.copy_(state.vol0.detach())
+        self.workspace.load_particles(state.mass.detach(), state.vol0.detach())
         self._law_cache_bytes = plan.law_cache_bytes if plan else 0
         self._cached: set[tuple] = set()  # evaluations of laws with valid caches
         self._segment_in_memory = 0
@@ -114,6 +115,7 @@ class Simulation:
         result = tuple(value.new_empty(len(frames), *value.shape) for value in start)
         for state, value in zip(states, start, strict=True):
             state[0].copy_(value)
+        ws.stuck[0].zero_()
         if self._uses_graphs:
             ws.load_weights(weights)
             weights = ws.weights
@@ -122,11 +124,12 @@ class Simulation:
         self._copy_frames(0, [0], frames, result)
         last = 0  # index of the last state of the previous segment
         for index, (first, steps) in enumerate(self._segments(frames)):
-            for state in states if last else ():
+            for state in ws.carried if last else ():
                 state[0].copy_(state[last])
-            for checkpoint, state in zip(ws.checkpoints, states, strict=True):
+            for checkpoint, state in zip(ws.checkpoints, ws.carried, strict=True):
                 if len(checkpoint):
                     checkpoint[index].copy_(state[0])
+            ws.load_poses(self.first + first, steps)
             if passive is None:
                 self._launch(("forward", steps), lambda steps=steps: self._advance(steps, weights))
             else:
@@ -162,11 +165,12 @@ class Simulation:
         else:
             grad_weights = [torch.zeros_like(w) for w in weights]
         totals = ws.grad_states
-        for total in (*totals, *grad_weights):
+        for total in (*ws.grad_carried, *grad_weights):
             total.zero_()
         for index, (first, steps) in reversed(list(enumerate(self._segments(frames)))):
+            ws.load_poses(self.first + first, steps)
             if index != self._segment_in_memory:
-                for checkpoint, state in zip(ws.checkpoints, ws.states, strict=True):
+                for checkpoint, state in zip(ws.checkpoints, ws.carried, strict=True):
                     state[0].copy_(checkpoint[index])
                 self._launch(("forward", steps), lambda steps=steps: self._advance(steps, weights))
                 self._segment_in_memory = index

@@ -18,9 +18,11 @@ from torch import Tensor
 
 from neuma_lib.sim import kernels
 from neuma_lib.sim.adjoint_kernels import adjoint_kernels
+from neuma_lib.sim.colliders import contact_radius
+from neuma_lib.sim.contact_kernels import obstacle_type, obstacles
 from neuma_lib.sim.graphs import MAX_GRAPHS, GraphCache
 from neuma_lib.sim.kernels import NO_FAULT, forward_kernels, warp_types
-from neuma_lib.sim.model import MPM
+from neuma_lib.sim.model import MPM, WALLS
 
 SORT_EVERY = 16
 """Steps between sorts of the particles by cell, for scatter methods that need it."""
@@ -48,6 +50,7 @@ class WorkspaceSize(NamedTuple):
     total: bool = False  # whether the state includes the total deformation
     copies: int = 1  # independent simulations with equal numbers of particles
     scatter: str = "atomic"  # scatter method
+    n_poses: int = 1  # steps of a segment if colliders move
 
 
 class Workspace:
@@ -61,10 +64,14 @@ class Workspace:
         C, F: affine velocities [1/s] and elastic deformation gradients, shape (n_states, N, 3, 3).
         F_total: total deformation gradients, shape (n_states, N, 3, 3), if the state includes them.
         states: x, v, F, C and optionally F_total; grad_states: their gradients.
+        stuck: tangential displacements of particles in contact [m], shape (n_states, N, 3), see `Collider`.
+        carried: states, and `stuck` with contact of particles; grad_carried: their gradients.
         tau, F_trial: Kirchhoff stresses [Pa] and trial deformation gradients, shape (n_cached_steps, N, 3, 3).
         grid: momentum [kg m/s] and mass [kg] of the nodes, shape (n_cached_steps, copies * nodes^3, 4).
         grid_v: velocity [m/s] of the nodes and 1 where there is mass, shape (n_cached_steps, copies * nodes^3, 4).
         mass, vol0: particle masses [kg] and initial volumes [m^3], shape (N,).
+        radius: radii of the particles in contact [m], shape (N,).
+        obstacles: colliders at the steps of a segment, or at one step if none moves, shape (poses, colliders).
         faults: first step and particle with a non-finite value, with a move of more than a cell in a step, and
             outside the grid, shape (copies, 3).
         order: particles sorted by cell every `SORT_EVERY` steps, shape (n_sorts, N).
@@ -92,12 +99,15 @@ class Workspace:
         if size.total:
             self.F_total = self._buffer((states, N), "mat33")
             self.states += (self.F_total,)
+        self.stuck = self._buffer((states, N) if self._contact else (1, 1), "vec3")
+        self.carried = (*self.states, self.stuck) if self._contact else self.states
         self.tau, self.F_trial = self._buffer((cached, N), "mat33"), self._buffer((cached, N), "mat33")
         self.grid, self.grid_v = self._buffer((cached, nodes), "vec4"), self._buffer((cached, nodes), "vec4")
-        self.mass, self.vol0 = self._buffer((N,), "real"), self._buffer((N,), "real")
+        self.mass, self.vol0, self.radius = (self._buffer((N,), "real") for _ in range(3))
+        self.obstacles = self._obstacles([0.0] * size.n_poses)
         self.faults = self._buffer((size.copies, 3), dtype=torch.int64)
         self.checkpoints = tuple(
-            value.new_empty(size.n_checkpoints, *value.shape[1:]) for value in self.states
+            value.new_empty(size.n_checkpoints, *value.shape[1:]) for value in self.carried
         )
         self.sorts = size.scatter != "atomic"
         n_sorts = -(-max(states - 1, 1) // SORT_EVERY) if self.sorts and size.differentiable else 1
@@ -114,6 +124,8 @@ class Workspace:
             if size.total:
                 self.grad_F_total = self._buffer((N,), "mat33")
                 self.grad_states += (self.grad_F_total,)
+            self.grad_stuck = self._buffer((N if self._contact else 1,), "vec3")
+            self.grad_carried = (*self.grad_states, self.grad_stuck)
             self.grad_grid = self._buffer((2, nodes), "vec4")
             self._record_adjoint()
 
@@ -134,6 +146,30 @@ class Workspace:
         if self.sorts and step % SORT_EVERY == 0:
             _run(self._cells, self.at(step))
             self.order[self.sorted_at(step)].copy_(torch.sort(self.cells, stable=True).indices)
+
+    def load_particles(self, mass: Tensor, vol0: Tensor) -> None:
+        """Set masses [kg], volumes [m^3] and radii of the particles."""
+        self.mass.copy_(mass)
+        self.vol0.copy_(vol0)
+        self.radius.copy_(contact_radius(vol0))
+
+    def pose_at(self, step: int) -> int:
+        """Row of the obstacles in a step."""
+        return step % self.size.n_poses
+
+    def load_poses(self, first: int, steps: int) -> None:
+        """Set the obstacles at the steps of a segment that starts at step ``first`` of the simulation."""
+        if self.size.n_poses > 1:
+            source = self._obstacles([self.size.model.dt * (first + n) for n in range(steps)])
+            wp.copy(self.obstacles, source, count=source.size)
+
+    def _obstacles(self, times: Sequence[float]) -> wp.array:
+        """Colliders at some times [s]."""
+        return wp.array(
+            obstacles(self.size.model.obstacles, times, self.size.dtype),
+            dtype=obstacle_type(self.size.dtype),
+            device=wp.device_from_torch(self.size.device),
+        )
 
     def load_weights(self, weights: Sequence[Tensor]) -> None:
         """Copy weights to their fixed addresses."""
@@ -166,7 +202,7 @@ class Workspace:
         """From tau and the state of a step to the velocities of the nodes."""
         cached = self.cached_at(step)
         self.grid[cached].zero_()
-        _run(self._p2g, self.at(step), cached, self.sorted_at(step))
+        _run(self._p2g, self.at(step), cached, self.sorted_at(step), self.pose_at(step), self.at(step + 1))
         _run(self._grid_update, cached)
 
     def transfer_to_particles(self, step: int) -> None:
@@ -182,7 +218,7 @@ class Workspace:
 
     def tracer_launch(self, tracers: Tensor) -> wp.Launch:
         """A recorded launch, for `move_tracers`, that advects `tracers` (M, 3) in place."""
-        kernel = forward_kernels(self.size.dtype, self.size.scatter).advect_tracers
+        kernel = forward_kernels(self.size.dtype, self.size.scatter, self._contact).advect_tracers
         positions = wp.from_torch(tracers, dtype=warp_types(self.size.dtype).vec3)
         return self._record(kernel, len(tracers), 0, self._rows(self.grid_v), positions)
 
@@ -202,7 +238,7 @@ class Workspace:
             _run(self._total_adjoint, now, after)
         _run(self._g2p_adjoint, now, after, cached, side, self.sorted_at(step))
         _run(self._grid_adjoint, cached, side)
-        _run(self._p2g_adjoint, now, cached, side)
+        _run(self._p2g_adjoint, now, cached, side, self.pose_at(step))
 
     @contextmanager
     def stream(self) -> Iterator[None]:
@@ -241,6 +277,11 @@ class Workspace:
         )
 
     @property
+    def _contact(self) -> bool:
+        """Whether particles touch colliders."""
+        return self.size.model.contact == "particles"
+
+    @property
     def _node_count(self) -> int:
         """Number of nodes of all copies."""
         return self.size.copies * self.size.model.nodes**3
@@ -252,14 +293,14 @@ class Workspace:
         return -(-N // BLOCK) * BLOCK if self.sorts else N
 
     def _record_forward(self) -> None:
-        k = forward_kernels(self.size.dtype, self.size.scatter)
+        k = forward_kernels(self.size.dtype, self.size.scatter, self._contact)
         N, nodes = self.size.particles, self._node_count
         rows, rows_v = self._rows(self.grid), self._rows(self.grid_v)
         if self.sorts:
             self._cells = self._record(k.cells, N, 0, self.x, self.cells)
         self._p2g = self._record(
-            k.p2g, self._scattering_threads, 0, 0, 0, self.order,
-            self.x, self.v, self.C, self.tau, self.mass, self.vol0, rows,
+            k.p2g, self._scattering_threads, 0, 0, 0, 0, 0, self.order,
+            self.x, self.v, self.C, self.tau, self.mass, self.vol0, self.radius, self.obstacles, self.stuck, rows,
         )  # fmt: skip
         self._grid_update = self._record(k.grid_update, nodes, 0, self.grid, self.grid_v)
         self._g2p = self._record(
@@ -272,7 +313,7 @@ class Workspace:
             self._total = self._record(k.trial_deformation, N, 0, 0, 0, self.C, F_total, F_total)
 
     def _record_adjoint(self) -> None:
-        k = adjoint_kernels(self.size.dtype, self.size.scatter)
+        k = adjoint_kernels(self.size.dtype, self.size.scatter, self._contact)
         N, nodes = self.size.particles, self._node_count
         rows_v, grad_rows = self._rows(self.grid_v), self._rows(self.grad_grid)
         self._g2p_adjoint = self._record(
@@ -282,9 +323,9 @@ class Workspace:
         )  # fmt: skip
         self._grid_adjoint = self._record(k.grid_adjoint, nodes, 0, 0, self.grid, self.grad_grid)
         self._p2g_adjoint = self._record(
-            k.p2g_adjoint, N, 0, 0, 0,
-            self.x, self.v, self.C, self.tau, self.mass, self.vol0, grad_rows,
-            self.grad_x, self.grad_v, self.grad_C, self.grad_tau,
+            k.p2g_adjoint, N, 0, 0, 0, 0,
+            self.x, self.v, self.C, self.tau, self.mass, self.vol0, self.radius, self.obstacles, self.stuck, grad_rows,
+            self.grad_x, self.grad_v, self.grad_C, self.grad_tau, self.grad_stuck,
         )  # fmt: skip
         if self.size.total:
             self._total_adjoint = self._record(
@@ -333,6 +374,7 @@ def _grid_constants(size: WorkspaceSize):
     c = t.GridConstants()
     c.particles = size.particles // size.copies
     c.n, c.wall_nodes, c.first = model.nodes, model.wall_nodes, model.first_node
+    c.faces = len(WALLS) if model.contact == "particles" else 0
     c.walls = t.walls(*(_CONDITION_CODES[condition] for condition in model.boundary))
     c.dx, c.inv_dx, c.dt = model.dx, float(model.grid), model.dt
     c.gravity = t.vec3(*model.gravity)

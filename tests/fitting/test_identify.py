@@ -269,7 +269,7 @@ def test_frames_after_the_contact_decide():
         video = VideoResiduals(MODEL, known(body, v0=v0), body, seen, chosen)
         video.hold_out(Family("hencky", ELASTIC), share)
         path = rollout(MODEL, analytic_law(ELASTIC), body.state(v0), steps=FRAMES[-1], frames=FRAMES)
-        informative = len(FRAMES) - first_contact(MODEL, path.x)
+        informative = len(FRAMES) - first_contact(MODEL, path.x, body.vol0)
         assert 0 < informative < len(FRAMES)
         assert len(FRAMES) - video.fitted == round(share * informative)
 

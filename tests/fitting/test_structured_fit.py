@@ -86,7 +86,7 @@ def test_the_last_training_goes_on_from_the_law_that_was_scored(problem, too_sti
     path = rollout(
         MODEL, structured_law(FLOWS, MODEL.dt).double(), body.state(V0), steps=FRAMES[-1], frames=FRAMES
     )
-    contact = first_contact(MODEL, path.x)
+    contact = first_contact(MODEL, path.x, body.vol0)
     trial, out = choice.trials["elastic"], len(choice.held_out_frames[0])
     informative = len(FRAMES) - contact
     assert contact > 0
@@ -316,9 +316,9 @@ def test_choices_of_parts():
 
 def test_the_first_contact_is_that_of_any_particle():
     x = torch.full((5, 2, 3), 0.5)
-    assert first_contact(MODEL, x) == 5
+    assert first_contact(MODEL, x, torch.full((2,), 1e-6)) == 5
     x[3:, 1, 1] = 0.01
-    assert first_contact(MODEL, x) == 3
+    assert first_contact(MODEL, x, torch.full((2,), 1e-6)) == 3
 
 
 def test_too_few_frames(problem):

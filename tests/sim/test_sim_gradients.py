@@ -18,7 +18,7 @@ pytestmark = pytest.mark.core
 
 IN_THE_AIR = MPM(14, DT)
 ON_A_STICKY_FLOOR = MPM(14, DT, boundary={"y_min": "sticky"})  # stops its nodes always: no switch
-ON_A_RELEASED_FLOOR = MPM(14, DT, boundary={"y_min": "sticky"}, walls="released")
+ON_A_RELEASED_FLOOR = MPM(14, DT, boundary={"y_min": "sticky"}, contact="released")
 TOUCHING = 0.12
 """Height [m] at which the cube of `scene` is in the floor."""
 COUNT = 60
@@ -140,8 +140,8 @@ BOUNCE = [1e-6, 1e-6, 1e-6, 1e-5]
 def test_finite_differences_through_a_bounce(boundary):
     """From free flight to the way back, with respect to x0, v0, F0 and C0; nodes start and stop on the way."""
     model, law, frames = MPM(14, DT, boundary=boundary), make_law("hencky"), (0, 40, 100)
-    path = simulate(model, law, falling(), frames)
-    assert contact_clearance(model, path[0][0]) > 0 > contact_clearance(model, path[0][1])
+    path, vol0 = simulate(model, law, falling(), frames), falling().vol0
+    assert contact_clearance(model, path[0][0], vol0) > 0 > contact_clearance(model, path[0][1], vol0)
     assert boundary == "sticky" or path[1][2, :, 1].mean() > 0.5
     assert_gradients_match(model, law, falling(), frames, BOUNCE)
 
@@ -154,28 +154,34 @@ def test_finite_differences_of_the_total_deformation_where_a_body_flows(name, fa
     """
     model, law, frames = MPM(14, DT), make_law(name), (0, 40, 100)
     x, _, F, _, F_total = simulate(model, law, falling(), frames, total=True)
-    assert contact_clearance(model, x[0]) > 0 > contact_clearance(model, x[1])
+    vol0 = falling().vol0
+    assert contact_clearance(model, x[0], vol0) > 0 > contact_clearance(model, x[1], vol0)
     assert (F_total[2] - F[2]).abs().max() > 0.1
     assert_gradients_match(model, law, falling(), frames, [factor * size for size in BOUNCE], total=True)
 
 
-def corner(walls="outside"):
+CONTACTS = [("nodes", False), ("released", False), ("nodes", True), ("particles", True)]
+
+
+def corner(contact="nodes"):
     """A model whose walls differ, and a cube in the corner where three of them meet."""
-    boundary = {"y_min": "no_slip", "x_min": "slip", "z_min": "sticky"}
-    thickness = {"wall_cells": 2} if walls == "released" else {}
-    model = MPM(14, DT, boundary=boundary, walls=walls, **thickness)
-    return model, scene(centre=3 * (0.22 if walls == "released" else TOUCHING,))
+    boundary = {"y_min": "no_slip", "x_min": "slip"}
+    if contact != "particles":
+        boundary["z_min"] = "sticky"
+    thickness = {"wall_cells": 2} if contact == "released" else {}
+    model = MPM(14, DT, boundary=boundary, contact=contact, **thickness)
+    return model, scene(centre=3 * (0.22 if contact == "released" else TOUCHING,))
 
 
-@pytest.mark.parametrize("walls, total", [("outside", False), ("released", False), ("outside", True)])
+@pytest.mark.parametrize("contact, total", CONTACTS)
 @pytest.mark.parametrize("cache_bytes", [0, math.inf])
 @pytest.mark.parametrize("name", ["von_mises", "drucker_prager", "fluid", "neural"])
-def test_equals_torch_twin(name, cache_bytes, walls, total):
+def test_equals_torch_twin(name, cache_bytes, contact, total):
     """States and gradients of 15 steps, at walls of every kind and with plastic flow, to 1e-9.
 
     The total deformation starts from an elastic one, and is recomputed too if memory is limited.
     """
-    model, start = corner(walls)
+    model, start = corner(contact)
     law, frames = make_law(name), (0, 4, 15)
     parameters = trainable(law)
     expected = gradients(model, law, start, frames, parameters, run=simulate_slowly, total=total)
@@ -206,7 +212,7 @@ def test_total_deformation_changes_no_other_value():
 
 def test_pressed_against_the_end_of_the_grid():
     """Particles that the released walls clamp where the stencil ends: states and gradients of the torch twin."""
-    model = MPM(14, 2e-3, boundary="slip", walls="released")
+    model = MPM(14, 2e-3, boundary="slip", contact="released")
     start = scene(0.18, side=0.2)
     start = replace(start, v=torch.tensor([0.3, -8.0, 0.1], dtype=start.x.dtype).repeat(COUNT, 1))
     law, frames = make_law("drucker_prager"), (4, 12)

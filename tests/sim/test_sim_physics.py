@@ -45,7 +45,7 @@ def test_free_fall(name, dtype, skip):
     n = torch.tensor(frames, dtype=torch.float64)[:, None, None]
     gravity = torch.tensor(model.gravity, dtype=torch.float64)
     fallen = x0 + v0 * n * DT + gravity * DT**2 * n * (n + 1) / 2
-    assert contact_clearance(model, fallen).min() > 0
+    assert contact_clearance(model, fallen, start.vol0.double()).min() > 0
     # n steps add at most n roundings of numbers below 1; F sees velocities over a cell, dt / dx.
     assert (path.x.double() - fallen).abs().max() < 60 * EPS[dtype]
     assert (path.v.double() - v0 - gravity * DT * n).abs().max() < 60 * 4 * EPS[dtype]
@@ -80,7 +80,7 @@ def test_momenta_of_a_spinning_cube(name):
     F0 = torch.linalg.matrix_exp(0.03 * torch.tensor([[1.0, 0.5, 0], [0.5, -1.5, 0], [0, 0, 0.5]]).double())
     state = State(x0, v0, mass, vol0, F0.expand(len(x0), 3, 3), C0)
     path = simulate(WEIGHTLESS, law, state, range(steps + 1))
-    assert contact_clearance(WEIGHTLESS, path.x).min() > 0
+    assert contact_clearance(WEIGHTLESS, path.x, vol0).min() > 0
     assert (path.F[-1] - path.F[0]).abs().max() > 1e-3  # it does deform
     linear = [linear_momentum(mass, path.v[n]) for n in (0, -1)]
     torch.testing.assert_close(linear[1], linear[0], rtol=1e-11, atol=0)
@@ -125,7 +125,7 @@ def test_free_rotation_of_a_stiff_cube():
     model, state = MPM(16, dt), State.rigid(x0, DENSITY * vol0, vol0, velocity, spin)
     assert not free_flight_steps(model, as_regions(law, len(x0)), state, steps)
     path = simulate(model, law, state, (steps,))
-    assert contact_clearance(model, path.x) > 0
+    assert contact_clearance(model, path.x, vol0) > 0
     t, gravity = steps * dt, torch.tensor(model.gravity)
     fallen = c + t * velocity + gravity * dt**2 * steps * (steps + 1) / 2
     R = torch.linalg.matrix_exp(t * cross_matrix(spin))
@@ -155,7 +155,7 @@ def test_impact_on_a_wall(wall, condition):
     v0, path = start.v, simulate(model, make_law("fixed_corotated"), start, range(121))
     low, high = model.stencil_range
     assert path.x.min() >= low and path.x.max() <= high
-    assert contact_clearance(model, path.x).min() < 0  # it did arrive
+    assert contact_clearance(model, path.x, start.vol0).min() < 0  # it did arrive
     toward = side * path.v[..., axis].mean(dim=1)
     assert -v0.norm() <= toward[-1] < 0
     assert path.v[-1].square().mean() <= v0.square().mean()
@@ -180,7 +180,7 @@ def test_free_flight_ends_where_contact_begins():
     model = MPM(16, 2e-3)
     start, steps = moving_cube((0.0, -2.0, 0.0), centre=(0.5, 0.4, 0.5)), 60
     path = simulate(model, make_law("hencky"), start, range(steps + 1), skip_free_flight=False)
-    first = int((contact_clearance(model, path.x) <= 0).int().argmax())
+    first = int((contact_clearance(model, path.x, start.vol0) <= 0).int().argmax())
     assert 0 < first < steps
     strain = (path.F - torch.eye(3)).abs().amax(dim=(1, 2, 3))
     assert strain[: first + 1].max() < 1e-12 < strain[first + 1]
@@ -195,7 +195,7 @@ def test_skipping_the_flight_changes_nothing(name):
         simulate(model, law, start, (0, 10, 40, 60), tracers=tracers, skip_free_flight=skip)
         for skip in (True, False)
     ]
-    assert contact_clearance(model, both[0].x[-1]) < 0
+    assert contact_clearance(model, both[0].x[-1], start.vol0) < 0
     for field in ("x", "v", "F", "C", "tracers"):
         a, b = (getattr(path, field) for path in both)
         torch.testing.assert_close(a, b, rtol=0, atol=1e-9)
@@ -287,8 +287,8 @@ def test_courant_number_names_the_largest_step():
         (dict(dt=-1.0), "dt"),
         (dict(dt=float("nan")), "dt"),
         (dict(gravity=(0.0, -9.8)), "gravity"),
-        (dict(walls="padded"), "walls"),
-        (dict(walls="released", wall_cells=0), "wall_cells"),
+        (dict(contact="padded"), "contact"),
+        (dict(contact="released", wall_cells=0), "wall_cells"),
         (dict(wall_cells=2), "wall_cells"),
     ],
 )

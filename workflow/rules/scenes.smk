@@ -174,7 +174,7 @@ def exposure(wildcards):
 def simulator(dt, grid=None):
     """Constants of the simulator with a time step [s], on the reconstruction's grid unless another is given."""
     section = SETTINGS.simulation.plain() | ({"grid": grid} if grid else {})
-    return {"dt": dt, **{name: section[name] for name in ("grid", "gravity", "boundary", "walls")}}
+    return {"dt": dt, **{name: section[name] for name in ("grid", "gravity", "boundary", "contact")}}
 
 
 def densities_of(scenes):

@@ -31,7 +31,7 @@ def main(inputs, output, params, run) -> None:
         filmed = {camera: [] for camera in params.cameras}
         for frame in read_transforms(inputs.transforms)["frames"]:
             filmed[params.cameras[frame["view"]]].append(frame["step"])
-        report = motion_report(mpm, path, start.mass, frames, filmed, params.scale)
+        report = motion_report(mpm, path, start, frames, filmed, params.scale)
         touched = f", touches {', '.join(report['touched'])}" if report["touched"] else ""
         message += f", first contact at {report['contact_step']}{touched}"
     else:

@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from torch import Tensor
-
 from neuma_lib.fitting.frame_batches import first_contact
 from neuma_lib.sim.model import MPM, WALLS
-from neuma_lib.sim.state import Trajectory
+from neuma_lib.sim.state import State, Trajectory
 
 FLOOR = "y_min"
 
@@ -17,7 +15,7 @@ FLOOR = "y_min"
 def motion_report(
     model: MPM,
     path: Trajectory,
-    mass: Tensor,
+    start: State,
     frames: Sequence[int],
     filmed: Mapping[str, Sequence[int]],
     scale: float = 1.0,
@@ -26,7 +24,7 @@ def motion_report(
 
     Args:
         path: the prediction at ``frames``.
-        mass: of its particles [kg], (N,).
+        start: its first state.
         frames: simulation steps.
         filmed: steps of the frames of each camera.
         scale: simulated metres per metre of the room.
@@ -35,9 +33,9 @@ def motion_report(
         ``contact_step`` (None without contact), ``frames_after_contact`` by camera, ``fastest_m_s``, the maximum speed
         of the centre of mass in the room, and ``touched``, names of walls other than the floor.
     """
-    first = first_contact(model, path.x)
+    first = first_contact(model, path.x, start.vol0, frames)
     contact = frames[first] if first < len(frames) else None
-    v = (path.v * (mass / mass.sum())[:, None]).sum(dim=1)
+    v = (path.v * (start.mass / start.mass.sum())[:, None]).sum(dim=1)
     low, high = model.free_range
     lowest, highest = path.x.amin(dim=(0, 1)).tolist(), path.x.amax(dim=(0, 1)).tolist()
     reached = [

@@ -1,0 +1,168 @@
+"""Rigid obstacles with a signed distance, friction and a prescribed motion."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from neuma_lib.errors import InputError
+from neuma_lib.sim.state import cross_matrix
+
+SIZES = {"plane": (), "box": ("half width", "half height", "half depth"), "sphere": ("radius",)}
+SIZES["capsule"] = ("half length", "radius")
+"""Lengths [m] that describe each shape. A plane fills y <= 0, a capsule extends along y, in the frame of the shape."""
+
+CONTACT_STIFFNESS = 0.5
+"""Part of a penetration that contact removes in a time step. Any value from 0.1 to 1 is stable on every grid."""
+
+
+@dataclass(frozen=True)
+class Collider:
+    """A rigid obstacle that particles touch.
+
+    A particle of volume V0 is a ball of radius `contact_radius`. Where its gap g to the collider is negative, contact
+    changes its velocity v before the transfer to the grid. With the time step dt, the outward normal n and the velocity
+    u of the collider at the particle:
+
+        impulse p = max(0, -alpha g / dt - damping n . (v - u)),   alpha = `CONTACT_STIFFNESS`,   v += p n
+        friction q = t + alpha s / dt, shortened to at most ``friction`` p,                      v -= q
+
+    Here t is the tangential part of v - u, and s (m) the tangential displacement of the particle since it sticks: a
+    spring as stiff as that of the gap. Without it a particle that sticks would creep, because the transfer to the grid
+    moves it in every step. s is zero without contact. In slip it keeps the length at which the spring alone has the
+    force ``friction`` p.
+
+    Attributes:
+        shape: one of `SIZES`.
+        size: its lengths [m].
+        centre: origin of its frame at t = 0 [m].
+        rotation: rotation vector of its frame at t = 0 [rad].
+        friction: Coulomb coefficient. Infinity sticks.
+        damping: part of the approaching velocity that an impulse removes, 0 (elastic) to 1.
+        velocity: of the centre [m/s].
+        spin: angular velocity about the centre [rad/s].
+
+    Raises:
+        InputError: a value is out of range or unknown.
+    """
+
+    shape: str
+    size: tuple[float, ...] = ()
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    friction: float = math.inf
+    damping: float = 0.0
+    velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    spin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self):
+        if self.shape not in SIZES:
+            raise InputError("collider.shape", f"{self.shape!r} must be one of {', '.join(SIZES)}")
+        lengths = SIZES[self.shape]
+        size = _numbers(self, "size", len(lengths), f"must be positive: {', '.join(lengths) or 'none'} [m]")
+        if not all(length > 0 for length in size):
+            raise InputError("collider.size", f"{self.size!r} must be positive: {', '.join(lengths)} [m]")
+        for name in ("centre", "rotation", "velocity", "spin"):
+            _numbers(self, name, 3, "must be three finite numbers")
+        if not self.friction >= 0:
+            raise InputError("collider.friction", f"{self.friction!r} must be a number of at least 0")
+        if not 0 <= self.damping <= 1:
+            raise InputError("collider.damping", f"{self.damping!r} must be a number from 0 to 1")
+
+    @staticmethod
+    def plane(point: Sequence[float], normal: Sequence[float], **options) -> Collider:
+        """The half-space below a plane through a point [m]; ``normal`` points out of it. Options as for `Collider`."""
+        n = torch.tensor(normal, dtype=torch.float64)
+        if n.shape != (3,) or not 0 < float(n.norm()) < math.inf:
+            raise InputError("collider.normal", f"{normal!r} must be a direction of three finite numbers")
+        n = n / n.norm()
+        up = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+        axis = torch.linalg.cross(up, n)
+        if float(axis.norm()) < 1e-12:  # any axis in the plane turns y to -y
+            axis = torch.tensor([math.pi if n[1] < 0 else 0.0, 0.0, 0.0], dtype=torch.float64)
+        else:
+            axis = axis / axis.norm() * torch.arccos(n[1].clamp(-1, 1))
+        return Collider("plane", (), tuple(point), tuple(axis.tolist()), **options)
+
+    @property
+    def moves(self) -> bool:
+        """Whether it has a velocity or a spin."""
+        return any((*self.velocity, *self.spin))
+
+    @property
+    def fastest(self) -> float:
+        """Upper bound of its speed [m/s] in the unit cube."""
+        reach = math.sqrt(3.0) + math.dist(self.centre, (0.5, 0.5, 0.5))
+        return math.hypot(*self.velocity) + math.hypot(*self.spin) * reach
+
+    def pose(self, time: float) -> tuple[Tensor, Tensor]:
+        """Axes (3, 3) of its frame as columns, and centre (3,) [m], both float64, at a time [s]."""
+        start = torch.linalg.matrix_exp(cross_matrix(_vector(self.rotation)))
+        turn = torch.linalg.matrix_exp(cross_matrix(time * _vector(self.spin))) if any(self.spin) else None
+        axes = start if turn is None else turn @ start
+        return axes, _vector(self.centre) + time * _vector(self.velocity)
+
+    def surface(self, x: Tensor, time: float = 0.0) -> tuple[Tensor, Tensor]:
+        """Signed distance (...,) [m] of points x (..., 3) to the surface, and outward normal (..., 3)."""
+        axes, centre = (value.to(x) for value in self.pose(time))
+        y = (x - centre) @ axes
+        if self.shape == "plane":
+            distance, normal = y[..., 1], torch.tensor([0.0, 1.0, 0.0]).to(x).expand_as(y)
+        elif self.shape == "box":
+            q = y.abs() - x.new_tensor(self.size)
+            deepest = torch.nn.functional.one_hot(q.argmax(dim=-1), 3).to(x)
+            beyond = torch.where((q > 0).any(dim=-1, keepdim=True), q.clamp(min=0), deepest)
+            length = beyond.norm(dim=-1, keepdim=True)
+            distance = torch.where((q > 0).any(dim=-1), length[..., 0], q.amax(dim=-1))
+            normal = torch.where(y < 0, -1.0, 1.0) * beyond / length
+        else:
+            half = self.size[0] if self.shape == "capsule" else 0.0
+            up = x.new_tensor([0.0, 1.0, 0.0])
+            q = y - y[..., 1:2].clamp(-half, half) * up
+            length = q.norm(dim=-1, keepdim=True)
+            distance, normal = length[..., 0] - self.size[-1], q / length
+        return distance, normal @ axes.mT
+
+    def velocity_at(self, x: Tensor, time: float = 0.0) -> Tensor:
+        """Velocity of the collider [m/s] at points x (..., 3)."""
+        _, centre = self.pose(time)
+        spin = _vector(self.spin).to(x).expand_as(x)
+        return _vector(self.velocity).to(x) + torch.linalg.cross(spin, x - centre.to(x))
+
+
+def contact_radius(vol0: Tensor) -> Tensor:
+    """Radius of a particle in contact [m], half the spacing of particles: V0^(1/3) / 2."""
+    return 0.5 * vol0.pow(1 / 3)
+
+
+def unit_cube(frictions: Sequence[float]) -> tuple[Collider, ...]:
+    """The faces of the unit cube from within, with a friction each: x_min, x_max, y_min, y_max, z_min, z_max."""
+    faces = []
+    for wall, friction in enumerate(frictions):
+        axis, upper = divmod(wall, 2)
+        normal = [0.0, 0.0, 0.0]
+        normal[axis] = -1.0 if upper else 1.0
+        point = [float(upper and a == axis) for a in range(3)]
+        faces.append(Collider.plane(point, normal, friction=friction))
+    return tuple(faces)
+
+
+def _numbers(collider: Collider, name: str, count: int, problem: str) -> tuple[float, ...]:
+    """Store a field as that many finite numbers."""
+    value = getattr(collider, name)
+    try:
+        numbers = tuple(float(v) for v in value)
+    except (TypeError, ValueError):
+        numbers = ()
+    if len(numbers) != count or not all(map(math.isfinite, numbers)) or len(numbers) != len(value):
+        raise InputError(f"collider.{name}", f"{value!r} {problem}")
+    object.__setattr__(collider, name, numbers)
+    return numbers
+
+
+def _vector(value: Sequence[float]) -> Tensor:
+    return torch.tensor(value, dtype=torch.float64)
