@@ -46,3 +46,10 @@ rule all:
 
 
 complete(workflow, RESULTS)
+if workflow.is_main_process and Path(workflow.main_snakefile).resolve() == ROOT / "Snakefile":
+    tables = [f"{table}.{kind}" for table in SETTINGS.tables for kind in ("csv", "md")]
+    checked(refuse_unknown)(
+        requested_targets(),
+        workflow.rules,
+        [*SETTINGS.scenes, *SETTINGS.methods, *SETTINGS.experiments, *SETTINGS.priors.laws, *tables],
+    )

@@ -115,7 +115,7 @@ def test_what_is_done_is_not_done_again_and_the_placement_repeats_what_it_moves(
         ("Splat/neuma/rollout.h5", "no video to learn a law from"),
         ("Splat/true_law/rollout.h5", "true law and motion of a captured object or a splat are unknown"),
         ("Splat/pac_nerf_own+law_from=BouncyBall/rollout.h5", "field"),
-        ("Splat/neuma/metrics.json", "No rule|Missing"),
+        ("Splat/neuma/metrics.json", "no rule makes|Missing"),
     ],
 )
 def test_what_a_splat_cannot_have_is_refused(project, target, message):

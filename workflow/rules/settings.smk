@@ -20,6 +20,7 @@ from neuma_lib.methods.registry import methods
 from workflow.defaults import complete, digest_of
 from workflow.provenance import code_digest
 from workflow.records import keep_records_of_failed_jobs
+from workflow.targets import refuse_unknown, requested_targets
 
 try:
     # Snakemake has read them, but keeps the last of repeated keys and bounds no aliases.
@@ -113,11 +114,11 @@ def kernels(*groups):
 
 
 def checked(function):
-    """An input or parameter function whose InputError ends Snakemake with its message alone."""
+    """A function whose InputError ends Snakemake with its message alone."""
 
-    def call(wildcards):
+    def call(*arguments):
         try:
-            return function(wildcards)
+            return function(*arguments)
         except InputError as error:
             raise WorkflowError(str(error)) from None
 

@@ -1,0 +1,57 @@
+"""Targets that no rule makes are refused with the nearest ones."""
+
+import re
+import sys
+from types import SimpleNamespace
+
+import pytest
+
+from tests.support.errors import refused
+from workflow.targets import refuse_unknown, requested_targets
+
+
+def rule(name, *patterns):
+    """A rule with outputs like ``results/{scene}/metrics.json``."""
+    expressions = [re.sub(r"\\\{(\w+)\\\}", r"[^/]+", re.escape(pattern)) for pattern in patterns]
+    return SimpleNamespace(
+        name=name,
+        output=patterns,
+        is_producer=lambda path: any(re.fullmatch(e, path) for e in expressions),
+    )
+
+
+RULES = [
+    rule("table", "results/table1.csv"),
+    rule("evaluate", "results/ClayCat/{method}/metrics.json"),
+    rule("all"),
+]
+NAMES = ["ClayCat", "neuma"]
+
+
+@pytest.mark.parametrize(
+    "target, near",
+    [
+        ("results/tabel1.csv", "results/table1.csv"),
+        ("results/ClayCatt/neuma/metrics.json", "results/ClayCat/neuma/metrics.json"),
+        ("result/ClayCat/neuma/metric.json", "results/ClayCat/neuma/metrics.json"),
+        ("results/ClayKat/neuma+rank=4/metrics.json", "results/ClayCat/neuma+rank=4/metrics.json"),
+        ("tabel", "table"),
+        ("everything", "neuma check"),
+    ],
+)
+def test_the_nearest_targets_are_named(target, near):
+    with refused(target, remedy=near):
+        refuse_unknown([target], RULES, NAMES)
+
+
+def test_rules_their_files_and_existing_files_are_targets(tmp_path):
+    refuse_unknown(
+        ["all", "results/table1.csv", "results/ClayCat/neuma/metrics.json", tmp_path], RULES, NAMES
+    )
+
+
+def test_targets_are_those_of_the_command_line(monkeypatch):
+    monkeypatch.setattr(
+        sys, "argv", ["snakemake", "-n", "--configfile", "a.yaml", "--", "results/table1.csv", "all"]
+    )
+    assert requested_targets() == ["results/table1.csv", "all"]
