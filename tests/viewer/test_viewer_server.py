@@ -362,7 +362,7 @@ def test_bodies_of_the_same_shape_have_labels(served):
     play.simulation.drop(0.0)
     for _ in range(2):
         assert play.add("letter_I") is None
-    assert reached(lambda: len(texts()) == 3) and texts() == ["1 BouncyBall", "2 letter_I", "3 letter_I"]
+    assert reached(lambda: texts() == ["1 BouncyBall", "2 letter_I", "3 letter_I"])
     heights = [label.position[1] for label in served._labels]
     assert heights == sorted(heights)
     play.reset()
