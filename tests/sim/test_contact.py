@@ -221,10 +221,10 @@ def test_momenta_change_by_the_impulse_on_the_collider():
     torch.testing.assert_close(spins[1] - spins[0], moment + lever, rtol=0, atol=1e-9)
 
 
-def test_a_plate_that_moves_up_lifts_a_resting_body():
-    """At constant speed the body follows the plate; it does not sink in by more than 0.25 dx."""
-    plate = Collider("box", (0.3, 0.02, 0.3), (0.5, 0.1, 0.5), velocity=(0.0, 0.4, 0.0), damping=0.5)
-    model = MPM(16, 5e-4, contact="particles", colliders=(plate,))
+def test_a_slab_that_moves_up_lifts_a_resting_body():
+    """At constant speed the body follows the slab; it does not sink in by more than 0.25 dx."""
+    slab = Collider("box", (0.3, 0.02, 0.3), (0.5, 0.1, 0.5), velocity=(0.0, 0.4, 0.0), damping=0.5)
+    model = MPM(16, 5e-4, contact="particles", colliders=(slab,))
     x, mass, vol0 = lattice(0.2, 8, (0.5, 0.222, 0.5))
     law = analytic_law({"elasticity": {"name": "neo_hookean", "E": 1e5, "nu": 0.3}}, 5e-4)
     path = rollout(model, law, State(x, torch.zeros(3).double(), mass, vol0), steps=1000, frames=(500, 1000))
