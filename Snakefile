@@ -52,4 +52,5 @@ if workflow.is_main_process and Path(workflow.main_snakefile).resolve() == ROOT 
         requested_targets(),
         workflow.rules,
         [*SETTINGS.scenes, *SETTINGS.methods, *SETTINGS.experiments, *SETTINGS.priors.laws, *tables],
+        missing_settings,
     )

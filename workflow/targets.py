@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from difflib import get_close_matches
 from itertools import islice, product
 from pathlib import Path
@@ -20,13 +20,19 @@ def requested_targets() -> list[str]:
     return parse_args(sys.argv[1:])[1].targets
 
 
-def refuse_unknown(targets: Iterable[str], rules, names: Iterable[str]) -> None:
+def refuse_unknown(
+    targets: Iterable[str],
+    rules,
+    names: Iterable[str],
+    settings_of: Callable[[str], Sequence[str]] = lambda target: (),
+) -> None:
     """Raise InputError for the first target that is neither a rule, nor a file that exists or that a rule makes.
 
     Args:
         targets: of Snakemake's command line.
         rules: of the workflow.
         names: of scenes, methods and others that files may have in their paths.
+        settings_of: settings files that the latest run of a target's folder had and this one has not.
     """
     made = [rule for rule in rules if rule.output]
     known = {rule.name for rule in rules}
@@ -41,6 +47,12 @@ def refuse_unknown(targets: Iterable[str], rules, names: Iterable[str]) -> None:
         options = [[part, *_similar(part, words)] for part in target.split("/")]
         tried = dict.fromkeys("/".join(parts) for parts in islice(product(*options), _TRIED))
         near = [path for path in tried if exists(path)][:3]
+        if missing := settings_of(target):
+            raise InputError(
+                target,
+                "no rule makes this file with these settings",
+                f"Add --configfile {' '.join(missing)} --",
+            )
         remedy = f"Similar: {', '.join(near)}" if near else "`neuma check` lists scenes and tables"
         raise InputError(target, "no rule makes this file, and it does not exist", remedy)
 

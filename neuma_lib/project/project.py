@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from neuma_lib.errors import InputError
+from neuma_lib.io.files import existing, write_text
 from neuma_lib.project.capture_scenes import captured_scenes
 from neuma_lib.project.loading import load, load_captures, merged, read_yaml
 from neuma_lib.project.settings import Config
 
 SETTINGS_FILE = Path("config/config.yaml")
 """Settings of a project, below its folder."""
+REMEMBERED = ".configfiles"
+"""Record of the settings files of the latest run, in a scene's folder of results."""
 
 
 def project_folder(place: str | Path) -> Path:
@@ -23,6 +27,30 @@ def project_folder(place: str | Path) -> Path:
             return folder
     problem = f"is not in a project: neither it nor a folder above it has {SETTINGS_FILE}"
     raise InputError(place, problem, "Clone the repository and use a folder in it")
+
+
+def remember_settings(folder: str | Path, configfiles: Sequence[str | Path], root: str | Path) -> None:
+    """Record in a folder of results which settings files its latest run had on top of those of the project."""
+    files = [os.path.relpath(file, root) for file in configfiles]
+    write_text(
+        Path(folder) / REMEMBERED, "".join(f"{file}\n" for file in files if Path(file) != SETTINGS_FILE)
+    )
+
+
+def remembered_settings(place: str | Path, root: Path) -> list[Path]:
+    """The settings files that the latest run of a folder of results had, or of the nearest folder above it.
+
+    Raises:
+        InputError: one of them no longer exists.
+    """
+    place = Path(place).absolute()
+    for folder in (place, *place.parents):
+        if folder == root or not folder.is_relative_to(root):
+            break
+        if (record := folder / REMEMBERED).is_file():
+            names = record.read_text(errors="replace").splitlines()
+            return [existing(root / name, "Give the settings by --configfile") for name in names]
+    return []
 
 
 class Project(NamedTuple):
@@ -41,7 +69,8 @@ class Project(NamedTuple):
         """The project that a folder lies in.
 
         Args:
-            configfiles: settings on top of those of the project, in this order, as by Snakemake's ``--configfile``.
+            configfiles: settings on top of those of the project, in this order, as by Snakemake's ``--configfile``. If
+                there are none, those of the latest run of the folder (`remembered_settings`).
             log: called for each capture that has no scenes, as by `captured_scenes`.
 
         Raises:
@@ -49,6 +78,7 @@ class Project(NamedTuple):
         """
         root = project_folder(place)
         raw: dict[str, Any] = {}
+        configfiles = configfiles or remembered_settings(place, root)
         for file in (root / SETTINGS_FILE, *configfiles):
             if not (content := read_yaml(file)):
                 raise InputError(file, "the file is empty", "Write settings into it, or leave it out")

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from neuma_lib.project.project import remember_settings, remembered_settings
 from tests.support.errors import refused
 from workflow.targets import refuse_unknown, requested_targets
 
@@ -55,3 +56,25 @@ def test_targets_are_those_of_the_command_line(monkeypatch):
         sys, "argv", ["snakemake", "-n", "--configfile", "a.yaml", "--", "results/table1.csv", "all"]
     )
     assert requested_targets() == ["results/table1.csv", "all"]
+
+
+def test_settings_of_an_earlier_run_are_named():
+    with refused("results/Mine/a", remedy="--configfile mine.yaml"):
+        refuse_unknown(["results/Mine/a"], RULES, NAMES, lambda target: ["mine.yaml"])
+
+
+def test_a_folder_of_results_remembers_its_settings(tmp_path):
+    """Those of the nearest folder above a place; none of them if the run had none, and a missing one is an error."""
+    for name in ("config/config.yaml", "mine.yaml"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    scene = tmp_path / "results" / "Mine"
+    (scene / "neuma").mkdir(parents=True)
+    assert remembered_settings(scene / "neuma", tmp_path) == []
+    remember_settings(scene, [tmp_path / "mine.yaml", tmp_path / "config/config.yaml"], tmp_path)
+    assert remembered_settings(scene / "neuma", tmp_path) == [tmp_path / "mine.yaml"]
+    (tmp_path / "mine.yaml").unlink()
+    with refused("mine.yaml", remedy="--configfile"):
+        remembered_settings(scene, tmp_path)
+    remember_settings(scene, [tmp_path / "config/config.yaml"], tmp_path)
+    assert remembered_settings(scene, tmp_path) == []

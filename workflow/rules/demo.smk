@@ -44,6 +44,8 @@ rule demo:
     output:
         page=f"{RESULTS}/demo.md",
     params:
+        methods=SETTINGS.demo.methods,
         titles=film_titles,
+        notes=[SETTINGS.methods[method].note for method in SETTINGS.demo.methods],
     script:
         "../scripts/demo.py"

@@ -14,6 +14,7 @@ from neuma_lib.project.capture_scenes import captured_scenes
 from neuma_lib.project.checks import local_problems, problems
 from neuma_lib.project import cases
 from neuma_lib.project.loading import load, load_captures, read_yaml
+from neuma_lib.project.project import remember_settings, remembered_settings
 from neuma_lib.errors import InputError
 from neuma_lib.mechanics.catalogue import DEFINED_IN
 from neuma_lib.methods.registry import methods
@@ -67,6 +68,8 @@ os.environ.update(
 # Runs when all jobs are known and none has started, and not in a dry run. A cluster's nodes are not this machine.
 onstart:
     keep_records_of_failed_jobs(workflow.persistence)
+    for scene in {job.wildcards_dict.get("scene") for job in workflow.dag.needrun_jobs()} - {None}:
+        remember_settings(f"{RESULTS}/{scene}", workflow.configfiles, ROOT)
     rules = sorted({job.rule.name for job in workflow.dag.needrun_jobs() if job.resources.get("gpu")})
     if SETTINGS.device == "cuda" and rules and workflow.local_exec:
         from neuma_lib.device import choose_device
@@ -123,6 +126,13 @@ def checked(function):
             raise WorkflowError(str(error)) from None
 
     return call
+
+
+def missing_settings(target):
+    """Settings files that the latest run of a target's folder had and this one has not."""
+    given = {Path(file).resolve() for file in workflow.configfiles}
+    files = [file.resolve() for file in remembered_settings(target, ROOT)]
+    return [os.path.relpath(file) for file in files if file not in given]
 
 
 def code_of(script, draws=False):

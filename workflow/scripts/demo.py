@@ -8,10 +8,10 @@ from workflow.stage import run_script
 PAGE = """\
 # What was learned
 
-![video, prior and learned law]({gif})
+![the video and the motions of the table]({gif})
 
-| | error of the 3D motion (RMSE) |
-|---|---:|
+| motion | error in 3D (RMSE) | what it is |
+|---|---:|---|
 {rows}
 
 - film: {film}
@@ -19,11 +19,23 @@ PAGE = """\
 {viewer}"""
 
 
+SENTENCES = {
+    "nclaw": "The law that is assumed before the video.",
+    "neuma": "The paper's method: a low-rank correction of the prior, trained from the pixels of one camera.",
+}
+"""What methods are that have no note."""
+
+
 def main(inputs, output, params, run) -> None:
     folder = Path(output.page).parent
     place = {name: Path(inputs[name]).relative_to(folder) for name in ("gif", "film", "law", "page")}
     errors = [read_json(file)["tracer_rmse_mm"] for file in inputs.metrics]
-    rows = [f"| {title} | {error:.1f} mm |" for title, error in zip(params.titles, errors, strict=True)]
+    rows = [
+        f"| {title} | {error:.1f} mm | {note or SENTENCES.get(method, '')} |"
+        for method, title, note, error in zip(
+            params.methods, params.titles, params.notes, errors, strict=True
+        )
+    ]
     viewer = listed(inputs.get("viewer"))
     line = f"- to play with: {Path(viewer[0]).relative_to(folder)}\n" if viewer else ""
     write_text(output.page, PAGE.format(rows="\n".join(rows), viewer=line, **place))
