@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import pickletools
 import zipfile
@@ -56,10 +57,15 @@ def read_torch(path: str | Path) -> Any:
             sizes = {member.filename.partition("/")[2]: member.file_size for member in members}
             if len(sizes) < len(members) or sum(sizes.values()) > size:
                 raise ValueError("two of its members have one name, or it claims more data than it has bytes")
-            for member in members:
-                if member.filename.endswith(".pkl"):
-                    _check_pickle(zip_member(archive, member, size), sizes)
-        return torch.load(path, map_location="cpu", weights_only=True)
+            checked = io.BytesIO()  # torch compares names and follows offsets in other ways than zipfile
+            with zipfile.ZipFile(checked, "w") as copy:
+                for member in members:
+                    content = zip_member(archive, member, size)
+                    if member.filename.lower().endswith(".pkl"):
+                        _check_pickle(content, sizes)
+                    copy.writestr(member.filename, content)
+        checked.seek(0)
+        return torch.load(checked, map_location="cpu", weights_only=True)
 
 
 _GLOBALS = {"torch._utils _rebuild_tensor_v2", "torch._utils _rebuild_parameter", "collections OrderedDict"}

@@ -463,6 +463,9 @@ TORCH = {
     "an encoder": pickled(ENCODED),
     "a key of nested tuples": pickled(b"\x80\x02}" + NESTED_TUPLES + b"K\1s."),
     "a tensor that is longer than its storage": LONGER,
+    "nested tuples in DATA.PKL": pickled(b"\x80\x02}" + NESTED_TUPLES + b"K\1s.").replace(
+        b"data.pkl", b"DATA.PKL"
+    ),
 }
 
 
