@@ -22,8 +22,10 @@ PAGE = """\
 SENTENCES = {
     "nclaw": "The law that is assumed before the video.",
     "neuma": "The paper's method: a low-rank correction of the prior, trained from the pixels of one camera.",
+    "neuma_structured": "The elastic or plastic family and constants that fit the video best, corrected by small "
+    "networks.",
 }
-"""What methods are that have no note."""
+"""What methods are. Others have their note in the settings."""
 
 
 def main(inputs, output, params, run) -> None:
@@ -31,7 +33,7 @@ def main(inputs, output, params, run) -> None:
     place = {name: Path(inputs[name]).relative_to(folder) for name in ("gif", "film", "law", "page")}
     errors = [read_json(file)["tracer_rmse_mm"] for file in inputs.metrics]
     rows = [
-        f"| {title} | {error:.1f} mm | {note or SENTENCES.get(method, '')} |"
+        f"| {title} | {error:.1f} mm | {SENTENCES.get(method) or note or ''} |"
         for method, title, note, error in zip(
             params.methods, params.titles, params.notes, errors, strict=True
         )
