@@ -68,8 +68,6 @@ os.environ.update(
 # Runs when all jobs are known and none has started, and not in a dry run. A cluster's nodes are not this machine.
 onstart:
     keep_records_of_failed_jobs(workflow.persistence)
-    for scene in {job.wildcards_dict.get("scene") for job in workflow.dag.needrun_jobs()} - {None}:
-        remember_settings(f"{RESULTS}/{scene}", workflow.configfiles, ROOT)
     rules = sorted({job.rule.name for job in workflow.dag.needrun_jobs() if job.resources.get("gpu")})
     if SETTINGS.device == "cuda" and rules and workflow.local_exec:
         from neuma_lib.device import choose_device
@@ -81,6 +79,8 @@ onstart:
                 f"{error}. Rules that wait for one: {', '.join(rules)}. Ground truth and images (target 'dataset')"
                 " need none."
             ) from None
+    for scene in {job.wildcards_dict.get("scene") for job in workflow.dag.needrun_jobs()} - {None}:
+        remember_settings(f"{RESULTS}/{scene}", workflow.configfiles, ROOT)
 
 
 def names_of(scenes, replicates=True):
