@@ -21,6 +21,7 @@ from neuma_lib.methods.registry import methods
 from workflow.defaults import complete, digest_of
 from workflow.provenance import code_digest
 from workflow.records import keep_records_of_failed_jobs
+from workflow.unlock import others
 from workflow.targets import refuse_unknown, requested_targets
 
 try:
@@ -39,7 +40,8 @@ except InputError as error:
 if workflow.is_main_process:
     if wrong := problems(SETTINGS):
         raise WorkflowError("\n".join(wrong))
-    for problem in [*map(str, BROKEN), *local_problems(SETTINGS)]:
+    busy = [f"Another Snakemake is at work in this folder ({process})" for process in others()]
+    for problem in [*busy, *map(str, BROKEN), *local_problems(SETTINGS)]:
         logger.warning(problem)
 
 KINDS = methods(SETTINGS.extensions)
