@@ -90,8 +90,9 @@ PLOTS = (
     "neuma_lib.evaluation.",
     "neuma_lib.capture.report.",
     "neuma_lib.data.blender.cycles",
+    "neuma_lib.viewer.gate",
 )
-"""Modules that may need an extra at import: those that draw and those that run inside Blender."""
+"""Modules that may need an extra at import: those that draw, run inside Blender or guard the viewer."""
 
 
 def test_without_the_extras_everything_but_plots_and_blender_imports():

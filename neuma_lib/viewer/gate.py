@@ -16,13 +16,11 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Annotated, Any, Literal
 from urllib.parse import urlsplit
 
+import msgspec  # installed with viser, which callers require first
 import numpy as np
+import websockets.asyncio.server
 
 from neuma_lib.errors import InputError
-from neuma_lib.extras import require
-
-msgspec = require("msgspec", "viewer")
-websockets = require("websockets.asyncio.server", "viewer")
 
 PORTS = 20
 """Number of consecutive ports that are tried."""
@@ -144,7 +142,7 @@ class Gate:
     @contextlib.contextmanager
     def installed(self) -> Iterator[None]:
         """Context in which a server of websockets is started behind this gate."""
-        plain = websockets.serve
+        plain = websockets.asyncio.server.serve
 
         def serve(handler: Callable, host: str, port: int, process_request: Callable, **options):
             def admitted(connection, request):
@@ -157,15 +155,15 @@ class Gate:
             options |= {"max_size": MAX_BYTES, "close_timeout": 1, "create_connection": _connection(self)}
             return plain(handler, sock=self.socket, process_request=admitted, **options)
 
-        websockets.serve = serve
+        websockets.asyncio.server.serve = serve
         try:
             yield
         finally:
-            websockets.serve = plain
+            websockets.asyncio.server.serve = plain
 
 
 def _connection(gate: Gate) -> type:
-    class Connection(websockets.ServerConnection):
+    class Connection(websockets.asyncio.server.ServerConnection):
         """A connection that receives only accepted messages, and is closed if it sends too many."""
 
         credit, counted = float(BURST), 0.0
