@@ -15,8 +15,8 @@ from neuma_lib.project.settings import Config
 
 SETTINGS_FILE = Path("config/config.yaml")
 """Settings of a project, below its folder."""
-REMEMBERED = ".configfiles"
-"""Record of the settings files of the latest run, in a scene's folder of results."""
+REMEMBERED = "configfiles.txt"
+"""Record of the settings files of a scene's latest run, with its logs."""
 
 
 def project_folder(place: str | Path) -> Path:
@@ -29,16 +29,17 @@ def project_folder(place: str | Path) -> Path:
     raise InputError(place, problem, "Clone the repository and use a folder in it")
 
 
-def remember_settings(folder: str | Path, configfiles: Sequence[str | Path], root: str | Path) -> None:
-    """Record in a folder of results which settings files its latest run had on top of those of the project."""
+def remember_settings(
+    results: str | Path, scene: str, configfiles: Sequence[str | Path], root: str | Path
+) -> None:
+    """Record which settings files the latest run of a scene had on top of those of the project."""
     files = [os.path.relpath(file, root) for file in configfiles]
-    write_text(
-        Path(folder) / REMEMBERED, "".join(f"{file}\n" for file in files if Path(file) != SETTINGS_FILE)
-    )
+    lines = [f"{file}\n" for file in files if Path(file) != SETTINGS_FILE]
+    write_text(Path(results, "logs", scene, REMEMBERED), "".join(lines))
 
 
 def remembered_settings(place: str | Path, root: Path) -> list[Path]:
-    """The settings files that the latest run of a folder of results had, or of the nearest folder above it.
+    """The settings files that the latest run of a scene had, given its folder of results or one below it.
 
     Raises:
         InputError: one of them no longer exists.
@@ -47,9 +48,10 @@ def remembered_settings(place: str | Path, root: Path) -> list[Path]:
     for folder in (place, *place.parents):
         if folder == root or not folder.is_relative_to(root):
             break
-        if (record := folder / REMEMBERED).is_file():
-            names = record.read_text(errors="replace").splitlines()
-            return [existing(root / name, "Give the settings by --configfile") for name in names]
+        for results in (above for above in folder.parents if above.is_relative_to(root)):
+            if (record := results / "logs" / folder.relative_to(results) / REMEMBERED).is_file():
+                names = record.read_text(errors="replace").splitlines()
+                return [existing(root / name, "Give the settings by --configfile") for name in names]
     return []
 
 

@@ -71,10 +71,12 @@ def test_a_folder_of_results_remembers_its_settings(tmp_path):
     scene = tmp_path / "results" / "Mine"
     (scene / "neuma").mkdir(parents=True)
     assert remembered_settings(scene / "neuma", tmp_path) == []
-    remember_settings(scene, [tmp_path / "mine.yaml", tmp_path / "config/config.yaml"], tmp_path)
+    remember_settings(
+        tmp_path / "results", "Mine", [tmp_path / "mine.yaml", tmp_path / "config/config.yaml"], tmp_path
+    )
     assert remembered_settings(scene / "neuma", tmp_path) == [tmp_path / "mine.yaml"]
     (tmp_path / "mine.yaml").unlink()
     with refused("mine.yaml", remedy="--configfile"):
         remembered_settings(scene, tmp_path)
-    remember_settings(scene, [tmp_path / "config/config.yaml"], tmp_path)
+    remember_settings(tmp_path / "results", "Mine", [tmp_path / "config/config.yaml"], tmp_path)
     assert remembered_settings(scene, tmp_path) == []

@@ -82,7 +82,7 @@ onstart:
                 " need none."
             ) from None
     for scene in {job.wildcards_dict.get("scene") for job in workflow.dag.needrun_jobs()} - {None}:
-        checked(remember_settings)(f"{RESULTS}/{scene}", workflow.configfiles, ROOT)
+        checked(remember_settings)(RESULTS, scene, workflow.configfiles, ROOT)
 
 
 def names_of(scenes, replicates=True):
