@@ -29,6 +29,7 @@ from neuma_lib.io.files import unwritable
 from neuma_lib.project import versions
 from workflow.manager import end_with_snakemake
 
+ONE_LINE = "NEUMA_ONE_LINE_A_JOB"  # set by `workflow.progress` for the processes of jobs
 PLAIN_INTERVAL = 15.0  # seconds between plain lines
 MOVING_INTERVAL = 0.2  # seconds between redraws of the moving bar
 STATE = "{n_fmt}/{total_fmt}{postfix}, {remaining} left"
@@ -111,9 +112,7 @@ class Stage:
             moving = self._terminal is not None
             interval = MOVING_INTERVAL if moving else PLAIN_INTERVAL
             # Where the bar cannot move, what it draws becomes lines.
-            lines = SimpleNamespace(
-                write=lambda text: text.strip() and self.log(text.strip()), flush=lambda: None
-            )
+            lines = SimpleNamespace(write=_write_progress, flush=lambda: None)
             self._bar = tqdm(
                 total=total,
                 initial=done,
@@ -163,9 +162,16 @@ class _Terminal(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         warned = record.name.startswith("neuma_lib") and record.levelno >= logging.WARNING
-        if warned or record.name == _LOGGER.name:
+        # Where Snakemake shows one line a job, results are in the log alone.
+        shown = hasattr(record, "progress") or not os.environ.get(ONE_LINE)
+        if warned or (record.name == _LOGGER.name and shown):
             tqdm.write(f"{self._run.name}: {record.getMessage()}", file=self._run.stream)
             self._run.stream.flush()
+
+
+def _write_progress(text: str) -> None:
+    if text.strip():
+        _LOGGER.info(text.strip(), extra={"progress": True})
 
 
 def _locked_terminal(stream: TextIO) -> TextIO | None:

@@ -135,6 +135,7 @@ class Project:
             "snakemake",
             "--configfile",
             "tests/workflow/tiny.yaml",
+            "--printshellcmds",  # all that Snakemake prints, not `workflow.progress`
             *self.executor,
             *words,
         ]

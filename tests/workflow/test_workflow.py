@@ -296,9 +296,16 @@ def test_a_killed_training_and_a_killed_snakemake_resume_with_the_same_result(cl
     assert {f.name for f in folder.iterdir()} - {".partial-checkpoint.pt"} == {"checkpoint.pt"}
 
     snakemake, training = started_training(clone)
+    os.killpg(snakemake.pid, signal.SIGINT)  # as Ctrl-C does
+    assert snakemake.wait(60) != 0 and not list((clone.root / ".snakemake/locks").iterdir())
+
+    snakemake, training = started_training(clone)
     assert re.search(r"resumed at iteration \d+ of 60", (clone.root / "started.log").read_text())
     busy = subprocess.run(make, cwd=clone.root, capture_output=True, text=True)
     assert busy.returncode != 0 and f"process {snakemake.pid}" in busy.stdout
+    assert f"Another Snakemake is at work in this folder (process {snakemake.pid}" in clone.run(
+        full_run.LONG, succeeds=False
+    )
     os.kill(snakemake.pid, signal.SIGKILL)
     snakemake.wait(60)
     # Its scripts do not go on alone.

@@ -20,10 +20,12 @@ from neuma_lib.mechanics.catalogue import DEFINED_IN
 from neuma_lib.methods.registry import methods
 from workflow.defaults import complete, digest_of
 from workflow.provenance import code_digest
+from workflow.progress import show_one_line_a_job
 from workflow.records import keep_records_of_failed_jobs
 from workflow.unlock import others
 from workflow.targets import refuse_unknown, requested_targets
 
+show_one_line_a_job(workflow)
 try:
     # Snakemake has read them, but keeps the last of repeated keys and bounds no aliases.
     for file in filter(os.path.isfile, workflow.configfiles if workflow.is_main_process else ()):
