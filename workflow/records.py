@@ -1,6 +1,10 @@
-"""What Snakemake remembers of a job that failed: what it remembered before."""
+"""What Snakemake concludes of failed jobs and of deleted results."""
 
 from __future__ import annotations
+
+from pathlib import Path
+
+from snakemake.persistence import PersistenceBase
 
 
 def keep_records_of_failed_jobs(persistence) -> None:
@@ -20,3 +24,26 @@ def keep_records_of_failed_jobs(persistence) -> None:
             await finished(job)
 
     persistence.finished = finished_with_outputs
+
+
+def remake_deleted_folders(results: str) -> None:
+    """From now on a file counts as incomplete if a folder of results that it was made of has been deleted.
+
+    For Snakemake alone, a table that exists is up to date even if what it was made of does not exist any more. Deleting
+    a method's folder would then not make it again for a table. Single files may still be deleted to save space.
+
+    Args:
+        results: folder of all results.
+    """
+    incomplete = PersistenceBase.incomplete
+
+    async def incomplete_or_without_inputs(self, job) -> list:
+        if files := await incomplete(self, job):
+            return files
+        for file in job.input:
+            folder = Path(file).parent
+            if folder.is_relative_to(results) and not folder.exists() and self.metadata(file):
+                return [made for made in job.output if await made.exists()]
+        return []
+
+    PersistenceBase.incomplete = incomplete_or_without_inputs

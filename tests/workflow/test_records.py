@@ -1,5 +1,6 @@
-"""The patch of Snakemake's records, against the installed Snakemake."""
+"""The patches of Snakemake's records, against the installed Snakemake."""
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -27,6 +28,23 @@ rule law:
     shell: "test ! -e broken && echo {{params.value}} > {{output}}"
 """
 
+DELETED = """
+import sys
+sys.path.insert(0, {root!r})
+from workflow.records import remake_deleted_folders
+if {patched}:
+    remake_deleted_folders("results")
+
+rule table:
+    input: "results/neuma/law.txt"
+    output: "table.txt"
+    shell: "cp {{input}} {{output}}"
+
+rule law:
+    output: "results/neuma/law.txt"
+    shell: "echo 1 > {{output}}"
+"""
+
 
 @pytest.mark.parametrize("patched", [True, False])
 def test_a_failed_job_counts_as_out_of_date(tmp_path, patched):
@@ -44,3 +62,23 @@ def test_a_failed_job_counts_as_out_of_date(tmp_path, patched):
     (tmp_path / "broken").unlink()
     status, plan = run(2, "--dry-run")
     assert status == 0 and ("Nothing to be done" in plan) != patched
+
+
+@pytest.mark.parametrize("patched", [True, False])
+def test_a_deleted_folder_is_made_again_for_a_table(tmp_path, patched):
+    """Without the patch it is not. A single deleted file is not made again either."""
+    (tmp_path / "Snakefile").write_text(DELETED.format(root=str(ROOT), patched=patched))
+
+    def run(*options):
+        command = [sys.executable, "-m", "snakemake", "--cores", "1", "--rerun-incomplete", *options]
+        done = subprocess.run([*command, "table.txt"], cwd=tmp_path, capture_output=True, text=True)
+        assert done.returncode == 0
+        return "Nothing to be done" in done.stdout + done.stderr
+
+    assert not run() and run()
+    folder = tmp_path / "results/neuma"
+    (folder / "law.txt").unlink()
+    assert run("--dry-run")
+    shutil.rmtree(folder)
+    assert run() != patched and (folder / "law.txt").exists() == patched
+    assert run()

@@ -21,7 +21,7 @@ from neuma_lib.methods.registry import methods
 from workflow.defaults import complete, digest_of
 from workflow.provenance import code_digest
 from workflow.progress import show_one_line_a_job
-from workflow.records import keep_records_of_failed_jobs
+from workflow.records import keep_records_of_failed_jobs, remake_deleted_folders
 from workflow.unlock import others
 from workflow.targets import refuse_unknown, requested_targets
 
@@ -49,6 +49,8 @@ if workflow.is_main_process:
 KINDS = methods(SETTINGS.extensions)
 DATA = SETTINGS.data_root.rstrip("/")
 RESULTS = SETTINGS.results_root.rstrip("/")
+if workflow.is_main_process and workflow.dag_settings.force_incomplete:
+    remake_deleted_folders(RESULTS)
 KERNELS = f"{DATA}/kernels"  # what is known of them; they themselves are in SETTINGS.kernel_cache
 HAS_CUDA = shutil.which("nvidia-smi") is not None
 GPU = int({"cpu": False, "cuda": True, "auto": HAS_CUDA}[SETTINGS.device])
