@@ -444,6 +444,7 @@ def law_parts(weight):
     return {part: dict.fromkeys(names, weight) for part in ("elasticity", "plasticity")}
 
 
+WITHOUT_MEMORY = torch_file(law_parts(torch.zeros(1, dtype=torch.float64).expand(2**20, 2**20)))
 TORCH = {
     "empty": b"",
     "text": b"no weights",
@@ -455,7 +456,7 @@ TORCH = {
     "weights that are numbers": torch_file(law_parts(5)),
     "weights that are text": torch_file(law_parts("text")),
     "weights of other shapes": torch_file(law_parts(torch.zeros(3))),
-    "weights without memory": torch_file(law_parts(torch.zeros(1, dtype=torch.float64).expand(2**20, 2**20))),
+    "weights without memory": WITHOUT_MEMORY,
     "truncated": torch_file(law_parts(torch.zeros(64, 64)))[:-200],
     "64 MiB deflated": deflated(law_parts(torch.zeros(2))),
     "64 MiB deflated, which its header denies": denied(deflated(law_parts(torch.zeros(2)), "data.pkl")),
@@ -474,7 +475,7 @@ def test_torch_files(tmp_path, content, capsys):
     path = tmp_path / "bad.pt"
     path.write_bytes(content)
     refused(load_prior, path)
-    if content is LONGER:
+    if content in (LONGER, WITHOUT_MEMORY):
         refused(read_torch, path)
     refused(lambda p: Checkpoint(p, {"a": 1}).load(), path, "rm ")
     assert "unpickled" not in capsys.readouterr().out
@@ -610,3 +611,29 @@ def test_pictures(tmp_path, read, write):
     with pytest.raises(InputError, match="picture.png") as caught:
         read(path)
     assert len(str(caught.value).splitlines()) == 1
+
+
+def deep_png(colours):
+    """An RGB image of 16 bits per channel, which Pillow cannot write."""
+    rows = b"".join(b"\0" + row.tobytes() for row in (colours.astype(">u2") * 257))
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", colours.shape[1], colours.shape[0], 16, 2, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
+
+
+@pytest.mark.parametrize(
+    "mode, kind",
+    [("1", "PNG"), ("P", "PNG"), ("LA", "PNG"), ("RGB", "PNG"), ("CMYK", "JPEG"), ("deep", "PNG")],
+)
+def test_all_kinds_of_pictures_keep_their_colours(tmp_path, mode, kind):
+    """Black, white and grey to within what JPEG loses."""
+    path = tmp_path / f"picture.{kind.lower()}"
+    grey = 255 if mode == "1" else 128
+    colours = np.repeat(np.kron([[0, 255], [grey, 255]], np.ones((8, 8)))[..., None], 3, axis=2).astype(
+        np.uint8
+    )
+    if mode == "deep":
+        path.write_bytes(deep_png(colours))
+    else:
+        image = Image.fromarray(colours)
+        (image.quantize(8) if mode == "P" else image.convert(mode)).save(path, kind, quality=100)
+    np.testing.assert_allclose(read_picture(path).astype(int), colours, atol=4)
