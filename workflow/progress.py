@@ -10,6 +10,7 @@ from collections import Counter, defaultdict
 from collections.abc import Sequence
 from datetime import timedelta
 from pathlib import Path
+from statistics import fmean
 from typing import Any, TextIO
 
 from snakemake.logging import DefaultFormatter, get_event, logger
@@ -114,23 +115,24 @@ class JobLines(DefaultFormatter):
         return "\n".join(f"{line}; {state}" for line in lines)
 
     def _left(self) -> str:
-        """Time left, from the mean seconds of the finished jobs of each rule and the jobs that ran at once."""
-        now, seconds, all_seen = self.clock(), 0.0, True
+        """Time left, from the mean seconds of the finished jobs of each rule and the jobs that ran at once.
+
+        A rule without finished jobs takes the mean of all.
+        """
+        now, seconds = self.clock(), 0.0
         running: dict[str, list[float]] = defaultdict(list)
         for job, start in self.started.items():
             running[self.rules[job]].append(now - start)
-        spent = sum(map(sum, [*self.seconds.values(), *running.values()]))
+        finished = [each for jobs in self.seconds.values() for each in jobs]
+        if not finished:
+            return ""
         for rule, count in self.counts.items():
             done = self.seconds.get(rule, [])
-            remaining = max(count - len(done), 0)
-            all_seen &= bool(done) or not remaining
-            mean = sum(done) / len(done) if done else 0.0
+            mean = fmean(done or finished)
             seconds += sum(max(mean - each, 0.0) for each in running[rule])
-            seconds += mean * max(remaining - len(running[rule]), 0)
-        if not spent or not seconds:
-            return ""
-        at_once = max(spent / max(now - self.began, 1e-9), 1.0)
-        return f"{'about' if all_seen else 'at least'} {_duration(seconds / at_once)}"
+            seconds += mean * max(count - len(done) - len(running[rule]), 0)
+        at_once = (sum(finished) + sum(map(sum, running.values()))) / max(now - self.began, 1e-9)
+        return f"about {_duration(seconds / max(at_once, 1.0))}"
 
     @staticmethod
     def _time() -> str:

@@ -38,7 +38,8 @@ def remake_deleted_folders(results: str) -> None:
     incomplete = PersistenceBase.incomplete
 
     async def incomplete_or_without_inputs(self, job) -> list:
-        if files := await incomplete(self, job):
+        files = await incomplete(self, job)
+        if files or not self.dag.workflow.dag_settings.force_incomplete:  # else they would be an error
             return files
         for file in job.input:
             folder = Path(file).parent

@@ -58,12 +58,12 @@ def test_a_line_for_each_finished_job():
     assert run.start(0, "fit", scene="Ball", method="neuma") is None
     run.now = 10.0
     line = run.finish(0, 1, 4)
-    # One job of 10 s at a time, two of them remain, and none of the last rule has run.
-    assert "fit Ball/neuma: 10.0 s; 1 of 4 jobs, at least 20 s left" in line
+    # One job of 10 s at a time. Two of them remain, and a job of another rule, which is taken to last as long.
+    assert "fit Ball/neuma: 10.0 s; 1 of 4 jobs, about 30 s left" in line
     run.start(1, "fit", scene="Cat", method="neuma")
     run.start(2, "evaluate", scene="Ball")
     run.now = 14.0
-    assert "evaluate Ball: 4.0 s; 2 of 4 jobs, about" in run.finish(2, 2, 4)
+    assert "evaluate Ball: 4.0 s; 2 of 4 jobs, about 12 s left" in run.finish(2, 2, 4)
 
 
 def test_time_left_counts_jobs_that_run_at_once():

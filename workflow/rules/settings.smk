@@ -49,7 +49,7 @@ if workflow.is_main_process:
 KINDS = methods(SETTINGS.extensions)
 DATA = SETTINGS.data_root.rstrip("/")
 RESULTS = SETTINGS.results_root.rstrip("/")
-if workflow.is_main_process and workflow.dag_settings.force_incomplete:
+if workflow.is_main_process:
     remake_deleted_folders(RESULTS)
 KERNELS = f"{DATA}/kernels"  # what is known of them; they themselves are in SETTINGS.kernel_cache
 HAS_CUDA = shutil.which("nvidia-smi") is not None
