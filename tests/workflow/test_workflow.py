@@ -92,6 +92,11 @@ def test_times_comments_and_docstrings_rerun_nothing(clone):
     assert clone.plan(TABLE) == {}
 
 
+def test_a_deleted_method_is_made_again_for_its_table(clone):
+    shutil.rmtree(clone.root / SCENE / "neuma")
+    assert clone.plan(TABLE) == {"fit_neuma": 1, "evaluate": 1, "chamfer_table": 1}
+
+
 def test_editing_the_rasterizer_reruns_what_renders(clone):
     """Of other edits, test_provenance.py computes what they rerun."""
     file = clone.root / "neuma_lib" / "splatting" / "rasterizer.py"
