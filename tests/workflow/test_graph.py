@@ -497,6 +497,8 @@ def test_a_broken_capture_stops_its_own_targets_only(project):
             "capture.yaml: line 3"
         )
         assert "Traceback (most recent call last)" not in refused_target
+        changed = overlay(scenes={"mug": {"density": 900}})
+        assert "capture.yaml: line 3" in project.run("--dry-run", *changed, TABLE, succeeds=False)
     finally:
         shutil.rmtree(capture.parent)
 

@@ -26,6 +26,7 @@ from workflow.unlock import others
 from workflow.targets import refuse_unknown, requested_targets
 
 show_one_line_a_job(workflow)
+BROKEN = []  # captures that have no scenes, which stop only the targets that need them
 try:
     # Snakemake has read them, but keeps the last of repeated keys and bounds no aliases.
     for file in filter(os.path.isfile, workflow.configfiles if workflow.is_main_process else ()):
@@ -33,12 +34,12 @@ try:
     captures = load_captures(config)
     # A workflow that includes this one may plan captures before their files exist.
     PLANNED = plan_captures(config, captures.root) if "plan_captures" in globals() else {}
-    BROKEN = []  # captures that have no scenes, which stop only the targets that need them
     SETTINGS = load(
         config, captured=captured_scenes(captures.root, captures.released, PLANNED, BROKEN.append)
     )
 except InputError as error:
-    raise WorkflowError(str(error)) from None
+    # Settings of a broken capture's scene are incomplete without it.
+    raise WorkflowError("\n".join(map(str, [*BROKEN, error]))) from None
 if workflow.is_main_process:
     if wrong := problems(SETTINGS):
         raise WorkflowError("\n".join(wrong))
