@@ -22,6 +22,7 @@ from neuma_lib.errors import InputError
 from neuma_lib.evaluation.metrics import tracer_errors
 from neuma_lib.fitting import identify as identification
 from neuma_lib.fitting.families import FAMILIES
+from neuma_lib.fitting.frame_batches import check_contact
 from neuma_lib.fitting.material import ParticleLoss, TrajectoryLoss, train_material
 from neuma_lib.fitting.structured_fit import train_structured
 from neuma_lib.fitting.velocity import estimate_velocity
@@ -284,7 +285,8 @@ def adapt(law: Law, scene: Scene, options: Mapping[str, Any] | None = None) -> A
         options: training options of the method ``neuma`` or ``structured``, for example ``{"iterations": 50}``.
 
     Raises:
-        InputError: an unknown option, too few frames, or the law is too stiff for the time step.
+        InputError: an unknown option, too few frames, no contact in the video, or the law is too stiff for the time
+            step.
         NonFiniteError: the first simulation is unstable.
 
     Example:
@@ -376,10 +378,13 @@ def _start_and_loss(scene: Scene, settings: TrainingConfig) -> tuple[State, Traj
     body = replace(scene.reconstruction, affine=settings.gaussian_motion == "affine")
     start = replace(scene, reconstruction=body).state()
     if settings.supervision == "pixels":
-        return start, pixel_loss(body, _of_body(_video(scene), body), settings)
-    if scene.truth is None:
+        loss = pixel_loss(body, _of_body(_video(scene), body), settings)
+    elif scene.truth is None:
         raise InputError("scene.truth", "is missing", "Use supervision: pixels")
-    return start, ParticleLoss(scene.truth.frames, scene.truth.x)
+    else:
+        loss = ParticleLoss(scene.truth.frames, scene.truth.x)
+    check_contact(scene.mpm, [(start, loss.frames)])
+    return start, loss
 
 
 def _load_truth(file: str | Path) -> Trajectory:

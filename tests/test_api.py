@@ -113,6 +113,13 @@ def test_options_that_the_scene_determines_are_refused(scene):
         nm.adapt(neural_law(seed=0), replace(scene, video=None))
 
 
+def test_a_law_is_not_adapted_to_free_flight(scene):
+    (video,) = scene.video.observations
+    first = nm.Video((replace(video, frames=video.frames[:2], images=video.images[:2]),))
+    with refused("frames", problem="touches nothing"):
+        nm.adapt(neural_law(seed=0), replace(scene, video=first))
+
+
 def test_a_motion_is_rendered(scene):
     images = nm.render(scene.truth, scene.reconstruction, scene.video.cameras)
     assert images.shape == (len(FRAMES), 1, 24, 24, 4)

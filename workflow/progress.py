@@ -54,7 +54,7 @@ class JobLines(DefaultFormatter):
         self.seconds: dict[str, list[float]] = defaultdict(list)  # of the finished jobs of each rule
         self.counts: Counter[str] = Counter()
         self.lines: list[str] = []  # of jobs that finished since the last state of the run
-        self.failed: dict[int, Sequence[str]] = {}  # logs of failed jobs
+        self.failed: dict[str, Sequence[str]] = {}  # logs of failed jobs
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Keep the start of a job from the handler, which writes an empty line before it."""
@@ -72,8 +72,9 @@ class JobLines(DefaultFormatter):
         elif event == LogEvent.PROGRESS:
             return self._progress(values["done"], values["total"])
         elif event == LogEvent.JOB_ERROR and values["log"]:
-            self.failed[values["jobid"]] = values["log"]
-            return f"{self._time()} {self.names.get(values['jobid'], values['rule_name'])} failed"
+            name = self.names.get(values["jobid"], values["rule_name"])
+            self.failed[name] = values["log"]
+            return f"{self._time()} {name} failed"
         elif record.levelno > logging.INFO or event is None:
             text = super().format(record)
             return "" if record.levelno <= logging.ERROR and text.startswith(ROUTINE) else text
@@ -81,13 +82,13 @@ class JobLines(DefaultFormatter):
 
     def end(self, stream: TextIO) -> None:
         """Write the last lines of the logs of failed jobs, with their paths."""
-        for job, logs in self.failed.items():
+        for name, logs in self.failed.items():
             for log in logs:
                 try:
                     lines = Path(log).read_text(errors="replace").splitlines()[-LAST_LINES:]
                 except OSError:
                     lines = []
-                print(f"\n{self.names[job]} failed. The end of {log}:", file=stream)
+                print(f"\n{name} failed. The end of {log}:", file=stream)
                 print(*(lines or ["(empty)"]), sep="\n", file=stream)
 
     def _run(self, stats: dict[str, int]) -> str:
