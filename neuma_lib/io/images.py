@@ -56,6 +56,8 @@ MAX_PIXELS = 2**26
 """Maximum size of an image: 8192 x 8192 pixels, 256 MiB of RGBA."""
 MAX_INTRINSIC = 1e7
 """Limit of focal lengths, principal points and image sizes [px]."""
+MIN_FOCAL = 0.5
+"""Focal length that every lens exceeds [px]."""
 EXPOSURE_SAMPLES = 5
 """Default maximum number of renders that are averaged to a frame."""
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -181,9 +183,10 @@ def _check_intrinsics(values: Mapping[str, Any], where: str) -> None:
         raise InputError(where, "has no intrinsics", remedy)
     for key in ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x"):
         value = values.get(key, 1)
+        least = MIN_FOCAL if key in ("fl_x", "fl_y") else 0
         limit = math.pi if key == "camera_angle_x" else MAX_INTRINSIC
-        if type(value) not in (int, float) or not (0 < value < limit):
-            problem = f"must be a positive number below {limit:g}, not {one_line(repr(value))}"
+        if type(value) not in (int, float) or not (least < value < limit):
+            problem = f"must be a number above {least:g} and below {limit:g}, not {one_line(repr(value))}"
             raise InputError(f"{where}: {key}", problem)
     if values.get("w", 1) * values.get("h", 1) > MAX_PIXELS:
         problem = f"{values['w']} x {values['h']} pixels exceed the maximum of {MAX_PIXELS}"

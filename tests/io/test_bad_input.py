@@ -556,6 +556,7 @@ CAMERAS = {
     "field of view of pi": lambda data, frame: data.update(camera_angle_x=np.pi),
     "field of view of 0": lambda data, frame: data.update(camera_angle_x=0),
     "focal length": lambda data, frame: data.update(fl_x=1e308),
+    "focal length near zero": lambda data, frame: data.update(fl_x=1e-300),
     "same image 20 times": lambda data, frame: data.update(frames=[frame] * 20),
     "same image by another path": lambda data, frame: data["frames"].append(
         {**frame, "file_path": "./0.png"}
