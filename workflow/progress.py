@@ -42,11 +42,13 @@ class JobLines(DefaultFormatter):
 
     Args:
         log: file with the whole output; None if there is none.
+        erase: what clears the line of a terminal, where a stage may have drawn its bar.
         clock: seconds, for tests.
     """
 
-    def __init__(self, log: str | None = None, clock=time.monotonic):
+    def __init__(self, log: str | None = None, erase: str = "", clock=time.monotonic):
         super().__init__()
+        self.erase = erase
         self.log, self.clock, self.began = log, clock, clock()
         self.names: dict[int, str] = {}
         self.rules: dict[int, str] = {}
@@ -64,6 +66,10 @@ class JobLines(DefaultFormatter):
         return True
 
     def format(self, record: logging.LogRecord) -> str:
+        text = self._text(record)
+        return text and self.erase + text
+
+    def _text(self, record: logging.LogRecord) -> str:
         event, values = get_event(record), record.__dict__
         if event == LogEvent.RUN_INFO:
             return self._run(values["stats"])
@@ -159,7 +165,7 @@ def show_one_line_a_job(workflow) -> None:
     files = [handler.baseFilename for handler in logger.handlers if isinstance(handler, logging.FileHandler)]
     for handler in logger.handlers:
         if handler.name == "DefaultStreamHandler":
-            lines = JobLines(*files[:1])
+            lines = JobLines(files[0] if files else None, erase="\r\033[K" if handler.is_tty else "")
             handler.setFormatter(lines)
             handler.addFilter(lines)
             atexit.register(lines.end, handler.stream)
