@@ -68,9 +68,11 @@ def plastic_strain(F: Tensor, total: Tensor) -> Tensor:
     """Equivalent plastic strain sqrt(2/3) |dev log sigma_p|, sigma_p the stretches of F_p = F^-1 F_total.
 
     Args:
-        F, total: elastic and total deformation gradients, (..., 3, 3).
+        F, total: elastic and total deformation gradients, (..., 3, 3). Where F is singular, the strain is 0.
     """
-    stretches = torch.linalg.svdvals(torch.linalg.solve(F, total)).clamp_min(1e-6)
+    plastic, singular = torch.linalg.solve_ex(F, total)
+    plastic = torch.where(singular[..., None, None] != 0, 0.0, plastic).nan_to_num(0.0, 0.0, 0.0)
+    stretches = torch.linalg.svdvals(plastic).clamp_min(1e-6)
     logs = stretches.log()
     deviator = logs - logs.mean(dim=-1, keepdim=True)
     return (2 / 3 * deviator.square().sum(dim=-1)).sqrt()

@@ -57,6 +57,12 @@ def test_plastic_strain_is_zero_for_an_elastic_body():
     assert scalars.plastic_strain(F, F).abs().max() < 1e-12
 
 
+def test_plastic_strain_is_zero_where_the_deformation_is_singular():
+    F = torch.stack([torch.zeros(3, 3), torch.diag(torch.tensor([1.0, 1.0, 1e-42])), stretched(0.15).float()])
+    strain = scalars.plastic_strain(F, F + 0.1)
+    assert strain.isfinite().all() and strain[0] == 0 and strain[2] > 0
+
+
 def test_total_deformation_is_exact_for_affine_motions():
     generator = torch.Generator().manual_seed(0)
     x0 = torch.rand(200, 3, generator=generator, dtype=torch.float64)
