@@ -19,7 +19,7 @@ from snakemake_interface_logger_plugins.common import LogEvent
 from workflow.stage import ONE_LINE
 
 LAST_LINES = 10  # of the log of a failed job
-# Messages without an event that say nothing of the work. Others are shown.
+# Prefixes of messages that do not concern the work. Other messages are displayed.
 ROUTINE = (
     "Building DAG of jobs",
     "Using shell:",
@@ -33,7 +33,7 @@ ROUTINE = (
     "Elapsed time:",
     "Shutting down, this might take some time.",
     "Exiting because a job execution failed.",
-    "RuleException:\nCalledProcessError",  # `JobLines.end` says more
+    "RuleException:\nCalledProcessError",  # `JobLines.end` names the cause
 )
 
 
@@ -154,12 +154,18 @@ def _duration(seconds: float, digits: int = 0) -> str:
 
 
 def show_one_line_a_job(workflow) -> None:
-    """Let the terminal of a run show `JobLines` from now on. Snakemake's log file stays as it is.
+    """Let the terminal of a run show `JobLines` from now on. Snakemake's log file is unchanged.
 
     Not in a dry run, in a job, or where an option asks for more or less (``-p``, ``--verbose``, ``--quiet``).
     """
-    shown = workflow.output_settings
-    if not workflow.is_main_process or shown.dryrun or shown.printshellcmds or shown.verbose or shown.quiet:
+    output = workflow.output_settings
+    if (
+        not workflow.is_main_process
+        or output.dryrun
+        or output.printshellcmds
+        or output.verbose
+        or output.quiet
+    ):
         return
     os.environ[ONE_LINE] = "1"
     files = [handler.baseFilename for handler in logger.handlers if isinstance(handler, logging.FileHandler)]

@@ -163,8 +163,8 @@ class _Terminal(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         warned = record.name.startswith("neuma_lib") and record.levelno >= logging.WARNING
         # Where Snakemake shows one line a job, results are in the log alone.
-        shown = hasattr(record, "progress") or not os.environ.get(ONE_LINE)
-        if warned or (record.name == _LOGGER.name and shown):
+        displayed = hasattr(record, "progress") or not os.environ.get(ONE_LINE)
+        if warned or (record.name == _LOGGER.name and displayed):
             tqdm.write(f"{self._run.name}: {record.getMessage()}", file=self._run.stream)
             self._run.stream.flush()
 
