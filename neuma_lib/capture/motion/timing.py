@@ -21,6 +21,10 @@ RATE = 16_000
 """Sampling rate of the compared sound [Hz]."""
 MAX_SOUND = 3600
 """Maximum duration of the sound of a video [s]: 230 MB at `RATE`."""
+SOUND_SECONDS = 4.0
+"""Maximum time to read the sound of a small file [s]. A sampling rate of 100 MHz takes much longer."""
+SOUND_RATE = 500e3
+"""Bytes of a larger file that may take a second more."""
 _BAND = (300.0, 6000.0)  # band of claps and impacts, above hum and below the filters of phones [Hz]
 SOUND_SPREAD = 0.005
 """Standard deviation of an offset due to the travel time of sound, 2.9 ms per metre, and delays in phones [s]."""
@@ -44,8 +48,12 @@ def read_sound(path: str | Path) -> np.ndarray | None:
     command = [*ffmpeg_input(path, "-v", "error"), "-map", "0:a:0?", "-af", "aresample=async=1:first_pts=0"]
     command += ["-ac", "1", "-ar", str(RATE), "-t", str(MAX_SOUND + 1), "-f", "f32le", "pipe:1"]
     process = start_child(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    longest = SOUND_SECONDS + path.stat().st_size / SOUND_RATE
     try:
-        sound, errors = process.communicate()
+        sound, errors = process.communicate(timeout=longest)
+    except subprocess.TimeoutExpired:
+        problem = f"its sound cannot be read within {longest:.0f} s"
+        raise InputError(path, problem, "Copy it from the camera again") from None
     finally:
         process.kill()
         process.wait()
