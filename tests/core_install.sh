@@ -33,7 +33,7 @@ echo
 # A copy without neuma_lib, so that the installed package is tested.
 work=$folder/work
 mkdir "$work"
-cp -r tests config benchmarks docs examples envs README.md Snakefile pyproject.toml "$work"
+cp -r tests config benchmarks docs examples envs README.md Snakefile mkdocs.yml pyproject.toml "$work"
 cd "$work"
 neuma=$(realpath ../bin/neuma) python=$(realpath -s ../bin/python)
 "$python" - <<'PYTHON'
