@@ -6,7 +6,7 @@ import atexit
 import logging
 import os
 import time
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Sequence
 from datetime import timedelta
 from pathlib import Path
@@ -54,7 +54,7 @@ class JobLines(DefaultFormatter):
         self.rules: dict[int, str] = {}
         self.started: dict[int, float] = {}
         self.seconds: dict[str, list[float]] = defaultdict(list)  # of the finished jobs of each rule
-        self.counts: Counter[str] = Counter()
+        self.counts: dict[str, int] = {}  # jobs of each rule
         self.lines: list[str] = []  # of jobs that finished since the last state of the run
         self.failed: dict[str, Sequence[str]] = {}  # logs of failed jobs
 
@@ -83,7 +83,7 @@ class JobLines(DefaultFormatter):
             return f"{self._time()} {name} failed"
         elif record.levelno > logging.INFO or event is None:
             text = super().format(record)
-            return "" if record.levelno <= logging.ERROR and text.startswith(ROUTINE) else text
+            return "" if text.startswith(ROUTINE) else text
         return ""
 
     def end(self, stream: TextIO) -> None:
@@ -98,7 +98,7 @@ class JobLines(DefaultFormatter):
                 print(*(lines or ["(empty)"]), sep="\n", file=stream)
 
     def _run(self, stats: dict[str, int]) -> str:
-        self.counts = Counter({rule: count for rule, count in stats.items() if rule != "total"})
+        self.counts = {rule: count for rule, count in stats.items() if rule != "total"}
         return f"{stats['total']} jobs" + (f"; the whole output of Snakemake: {self.log}" if self.log else "")
 
     def _start(self, values: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""What Snakemake concludes of failed jobs and of deleted results."""
+"""Patches of Snakemake's records: failed jobs, and folders of results that were deleted."""
 
 from __future__ import annotations
 

@@ -14,6 +14,7 @@ from neuma_lib.io.files import existing, one_line, reading
 MAX_BYTES = 300_000
 MAX_EXPANDED = 1_000_000  # values and characters, with every alias replaced by what it names
 MAX_DEPTH = 50  # deeper nesting overflows the stack of the parser in C
+TOO_DEEP = f"values are nested more than {MAX_DEPTH} deep"
 MAX_TEXT = (
     3_000  # characters of one value; longer integers take quadratic time, and Python does not print them
 )
@@ -51,7 +52,11 @@ def parse_yaml(content: str | bytes, where: str | Path) -> Any:
             _check(content, where)
             return yaml.load(content, Loader=_LOADER)
         except yaml.MarkedYAMLError as error:
-            raise _at(where, error.problem_mark, f"invalid YAML: {error.problem}") from None
+            # The parser in C of some versions has its own limit, and may reach it before the first event.
+            too_deep = "nesting depth" in (error.problem or "")
+            raise _at(
+                where, error.problem_mark, TOO_DEEP if too_deep else f"invalid YAML: {error.problem}"
+            ) from None
 
 
 @dataclass
@@ -75,7 +80,7 @@ def _check(content: str | bytes, where: str | Path) -> None:
             sizes.pop(event.anchor, None)
             within.append(_Open(event.anchor, isinstance(event, yaml.MappingStartEvent)))
             if len(within) > MAX_DEPTH:
-                raise _at(where, event.start_mark, f"values are nested more than {MAX_DEPTH} deep")
+                raise _at(where, event.start_mark, TOO_DEEP)
             continue
         if isinstance(event, yaml.ScalarEvent):
             if len(event.value) > MAX_TEXT:

@@ -1,7 +1,5 @@
 """Offsets between cameras: known delays of sound and motion."""
 
-import time
-
 import numpy as np
 import pytest
 from scipy.io import wavfile
@@ -75,17 +73,16 @@ def test_sound_keeps_the_clock_of_its_video(tmp_path):
         read_sound(tmp_path / "d.mp4")
 
 
-def test_a_sampling_rate_of_a_hundred_megahertz_is_refused(tmp_path):
-    """The decoder would compute filters for 10 s."""
+def test_a_sampling_rate_of_a_hundred_megahertz_is_refused(tmp_path, monkeypatch):
+    """The decoder would compute filters for seconds."""
+    monkeypatch.setattr(timing, "SOUND_SECONDS", 0.5)
     path = tmp_path / "fast.wav"
     ffmpeg("-f", "lavfi", "-i", "anullsrc=r=44100:cl=mono", "-t", 0.01, path)
     content = bytearray(path.read_bytes())
     content[24:28] = (134_261_828).to_bytes(4, "little")
     path.write_bytes(content)
-    started = time.monotonic()
-    with refused(path):
+    with refused(path, problem="cannot be read within"):
         read_sound(path)
-    assert time.monotonic() - started < 5
 
 
 def test_sound_of_hours_is_refused_before_it_is_decoded(tmp_path, monkeypatch):

@@ -27,7 +27,7 @@ ALIASES = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
         (ALIASES.replace("[*", "{<<: [*").replace("]\n", "]}\n"), "line"),
         ("a: &a [*a]", "line 1, column 8: *a"),
         ("a: *b", "*b names nothing"),
-        ("[" * 200_000, "nest"),
+        ("[" * 200_000, "nested"),
         ("- " * 100_000, "nested"),
         ("{a: " * 50_000, "nested"),
         ("- &a\n" * 50_000, "line 2, column 3"),

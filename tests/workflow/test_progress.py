@@ -1,97 +1,159 @@
-"""One line a finished job, and the end of a failed job's log."""
+"""A stage reports what it does on any terminal, alone or next to others, and why it failed."""
 
-from __future__ import annotations
-
+import fcntl
 import io
+import itertools
 import logging
+import os
+import pty
+import re
 import subprocess
 import sys
+import time
+import warnings
+from pathlib import Path
 
 import pytest
-from snakemake_interface_logger_plugins.common import LogEvent
 
-from neuma_lib.errors import InputError
-from tests.support.project import ROOT
-from workflow.progress import JobLines
-from workflow.stage import ONE_LINE, stage
+from neuma_lib.errors import InputError, NonFiniteError
+from workflow import stage as progress
 
-SNAKEFILE = """
-import sys
-sys.path.insert(0, {root!r})
-from workflow.progress import show_one_line_a_job
-show_one_line_a_job(workflow)
-
-rule table:
-    input: "a.txt", "b.txt"
-
-rule law:
-    output: "{{name}}.txt"
-    log: "{{name}}.log"
-    shell: "echo {{wildcards.name}} > {{log}}; test {{wildcards.name}} != b && touch {{output}}"
-"""
+ROOT = Path(__file__).resolve().parents[2]
 
 
-class Run:
-    """Formats events of a run with a clock that is set by hand."""
+@pytest.fixture
+def terminal():
+    """A pseudo-terminal: (its stream, a function that returns what was written)."""
+    reader, writer = pty.openpty()
+    stream = os.fdopen(writer, "w")
 
-    def __init__(self):
-        self.now = 0.0
-        self.lines = JobLines(log="snakemake.log", clock=lambda: self.now)
+    def written():
+        stream.flush()
+        os.set_blocking(reader, False)
+        text = b""
+        while True:
+            try:
+                text += os.read(reader, 65536)
+            except (BlockingIOError, OSError):
+                return text.decode()
 
-    def event(self, event=None, message=None, level=logging.INFO, **values):
-        record = logging.LogRecord("snakemake", level, "", 0, message, None, None)
-        record.__dict__.update(values, **({"event": event} if event else {}))
-        return self.lines.format(record) if self.lines.filter(record) else None
-
-    def start(self, job, rule, **wildcards):
-        return self.event(LogEvent.JOB_INFO, jobid=job, rule_name=rule, wildcards=wildcards)
-
-    def finish(self, job, done, total):
-        assert not self.event(LogEvent.JOB_FINISHED, "Finished", job_id=job)
-        return self.event(LogEvent.PROGRESS, done=done, total=total)
-
-
-def test_a_line_for_each_finished_job():
-    run = Run()
-    stats = {"fit": 3, "evaluate": 1, "total": 4}
-    assert run.event(LogEvent.RUN_INFO, "Job stats:", stats=stats).startswith("4 jobs")
-    assert run.start(0, "fit", scene="Ball", method="neuma") is None
-    run.now = 10.0
-    line = run.finish(0, 1, 4)
-    # One job of 10 s at a time. Two of them remain, and a job of another rule, which is taken to last as long.
-    assert "fit Ball/neuma: 10.0 s; 1 of 4 jobs, about 30 s left" in line
-    run.start(1, "fit", scene="Cat", method="neuma")
-    run.start(2, "evaluate", scene="Ball")
-    run.now = 14.0
-    assert "evaluate Ball: 4.0 s; 2 of 4 jobs, about 12 s left" in run.finish(2, 2, 4)
+    yield stream, written
+    stream.close()
+    os.close(reader)
 
 
-def test_time_left_counts_jobs_that_run_at_once():
-    run = Run()
-    run.event(LogEvent.RUN_INFO, "Job stats:", stats={"fit": 4, "total": 4})
-    for job in (0, 1):
-        run.start(job, "fit", scene=f"scene{job}")
-    run.now = 60.0
-    run.finish(0, 1, 4)
-    assert "2 of 4 jobs, about 1:00 left" in run.finish(1, 2, 4)
+def test_a_bar_with_loss_and_time_left(terminal, tmp_path):
+    stream, written = terminal
+    with progress.stage("material Ball", tmp_path / "material.log", stream) as run:
+        run.progress(1, 10, 0.5)
+        time.sleep(2 * progress.MOVING_INTERVAL)
+        run.progress(5, 10, 0.25)
+        text = written()
+        run.log("loss 0.5 -> 0.25")
+    assert "\rmaterial Ball  " in text and re.search(r"5/10, loss 0.25, 00:0\d left", text)
+    assert "█" * 12 + " " * 12 in text
+    assert "\rmaterial Ball: loss 0.5 -> 0.25\r\n" in written()
+    assert "loss 0.5 -> 0.25" in (tmp_path / "material.log").read_text()
 
 
-def test_routine_messages_are_hidden_and_others_shown():
-    run = Run()
-    assert run.event(message="Building DAG of jobs...") == ""
-    assert run.event(LogEvent.RESOURCES_INFO, "Provided cores: 2") == ""
-    assert run.event(message="Nothing to be done.") == "Nothing to be done."
-    assert run.event(message="disk is full", level=logging.WARNING) == "disk is full"
-    assert run.event(message="MissingOutputException", level=logging.ERROR) == "MissingOutputException"
+def test_work_may_turn_out_to_be_more(terminal):
+    stream, written = terminal
+    with progress.stage("prior water", None, stream) as run:
+        run.progress(9, 10, 0.5)
+        time.sleep(2 * progress.MOVING_INTERVAL)
+        run.progress(11, 20, 0.5)
+        assert "11/20" in written()
+
+
+def test_of_two_stages_on_one_terminal_the_second_prints_lines(terminal, monkeypatch):
+    monkeypatch.setattr(progress, "PLAIN_INTERVAL", 0.0)
+    stream, written = terminal
+    with open(os.ttyname(stream.fileno())) as first:
+        fcntl.flock(first, fcntl.LOCK_EX)
+        with progress.stage("second", None, stream) as second:
+            second.progress(1, 4, 2.0)
+            second.progress(2, 4, 1.0)
+        text = written()
+        assert re.search(r"^second: 2/4, loss 1, 00:00 left\r\n", text, re.MULTILINE) and "█" not in text
+    with progress.stage("third", None, stream) as third:
+        third.progress(1, 4)
+        time.sleep(2 * progress.MOVING_INTERVAL)
+        third.progress(2, 4)
+        assert "\rthird  █" in written(), "the terminal is free again"
+
+
+def test_plain_lines_now_and_then_where_there_is_no_terminal(monkeypatch, tmp_path):
+    def lines():
+        stream = io.StringIO()
+        with progress.stage("gaussians Ball", tmp_path / "log", stream) as run:
+            for i in range(5):
+                run.progress(i + 1, 5, 1.0)
+        assert not {"\r", "\x1b"} & set(stream.getvalue())
+        return stream.getvalue().splitlines()
+
+    assert lines() == [], "short stages need none"
+    monkeypatch.setattr(progress, "PLAIN_INTERVAL", 0.0)
+    assert len(lines()) >= 4 and lines()[-1].startswith("gaussians Ball: 5/5, loss 1, ")
+    assert "5/5, loss 1" in (tmp_path / "log").read_text()
+
+
+def test_lines_go_on_when_the_clock_jumps_back(monkeypatch):
+    monkeypatch.setattr(progress, "PLAIN_INTERVAL", 0.0)
+    hours = itertools.count(0, -3600)
+    monkeypatch.setattr("tqdm.std.time", lambda: float(next(hours)))
+    stream = io.StringIO()
+    with progress.stage("gaussians Ball", None, stream) as run:
+        for i in range(5):
+            run.progress(i + 1, 5)
+    assert re.search(r"4/5, 00:00 left", stream.getvalue())
+
+
+@pytest.mark.parametrize(
+    ("error", "shown"),
+    [
+        (InputError("a.png is truncated: replace it"), "ERROR: a.png is truncated: replace it"),
+        (NonFiniteError("material", "iteration 3"), "ERROR: material: iteration 3"),
+        (
+            OSError(28, "No space left on device", "a.png"),
+            "ERROR: a.png: cannot be written: No space left on device. Free disk space and run the same command again.",
+        ),
+        (KeyError("x"), "ERROR: KeyError: 'x'"),
+        (KeyboardInterrupt(), "ERROR: interrupted; run the same command again to go on"),
+    ],
+)
+def test_errors_are_reported_in_one_line_and_logged_in_full(tmp_path, error, shown):
+    log, stream = tmp_path / "deep" / "stage.log", io.StringIO()
+    with pytest.raises(SystemExit) as end, progress.stage("mesh Ball", log, stream):
+        raise error
+    assert end.value.code == 1
+    assert stream.getvalue() == f"mesh Ball: {shown} (more in {log})\n"
+    assert "Traceback" in log.read_text() and type(error).__name__ in log.read_text()
+
+
+def test_a_log_on_a_full_disk_adds_no_error(capsys):
+    """/dev/full refuses every byte, as a full disk does."""
+    stream = io.StringIO()
+    with pytest.raises(SystemExit), progress.stage("mesh Ball", "/dev/full", stream):
+        raise OSError(28, "No space left on device")
+    assert stream.getvalue().startswith("mesh Ball: ERROR: output: cannot be written: No space left")
+    assert capsys.readouterr().err == ""
+
+
+def test_warnings_go_to_the_log(tmp_path):
+    stream = io.StringIO()
+    with progress.stage("mesh Ball", tmp_path / "log", stream):
+        warnings.warn("slow path", stacklevel=1)
+    assert "UserWarning: slow path" in (tmp_path / "log").read_text()
+    assert stream.getvalue() == ""
 
 
 @pytest.mark.parametrize("one_line", [True, False])
 def test_results_of_a_stage_are_in_its_log(tmp_path, monkeypatch, one_line):
     """With one line a job, the terminal shows only its progress, warnings and errors."""
-    monkeypatch.setattr("workflow.stage.PLAIN_INTERVAL", 0.0)
-    monkeypatch.setenv(ONE_LINE, "1" if one_line else "")
+    monkeypatch.setattr(progress, "PLAIN_INTERVAL", 0.0)
+    monkeypatch.setenv(progress.ONE_LINE, "1" if one_line else "")
     terminal, log = io.StringIO(), tmp_path / "fit.log"
-    with pytest.raises(SystemExit), stage("fit Ball", log, terminal) as run:
+    with pytest.raises(SystemExit), progress.stage("fit Ball", log, terminal) as run:
         run.log("loss 0.5")
         run.progress(1, 2)
         logging.getLogger("neuma_lib.sim").warning("slow")
@@ -101,17 +163,24 @@ def test_results_of_a_stage_are_in_its_log(tmp_path, monkeypatch, one_line):
     assert "fit Ball: 1/2" in shown and "fit Ball: slow" in shown and "ERROR: a.yaml: is empty" in shown
 
 
-def test_a_run_ends_with_the_log_of_the_failed_job(tmp_path):
-    (tmp_path / "Snakefile").write_text(SNAKEFILE.format(root=str(ROOT)))
-
-    def run(*options):
-        command = [sys.executable, "-m", "snakemake", "--cores", "1", "--keep-going", *options, "table"]
-        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
-        assert done.returncode != 0
-        return done.stderr.splitlines()
-
-    lines = run()
-    assert lines[-2:] == ["law b failed. The end of b.log:", "b"]
-    (finished,) = [line for line in lines if " law a: " in line]
-    assert "1 of 3 jobs" in finished and len(lines) < 15
-    assert any("rule law:" in line for line in run("--printshellcmds"))
+def test_a_script_ends_with_its_snakemake(tmp_path):
+    """A Snakemake that is killed outright takes along what runs below it, through processes between; nothing else."""
+    sleep = "import time; time.sleep(60)"
+    script = (
+        "from workflow.manager import end_with_snakemake; end_with_snakemake();"
+        f"print('ready', flush=True); {sleep}"
+    )
+    snakemake = tmp_path / "snakemake"
+    between = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {script!r}])"
+    snakemake.write_text(f"import subprocess, sys; subprocess.run([sys.executable, '-c', {between!r}])")
+    options = dict(cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    boss = subprocess.Popen([sys.executable, str(snakemake)], **options)
+    free = subprocess.Popen([sys.executable, "-c", script], **options)
+    assert boss.stdout.readline() == "ready\n" and free.stdout.readline() == "ready\n"
+    boss.kill()
+    boss.wait()
+    # The pipe closes when the last process that holds it has ended.
+    assert boss.stdout.read() == ""
+    assert free.poll() is None
+    free.kill()
+    free.wait()
