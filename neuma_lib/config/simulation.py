@@ -36,7 +36,7 @@ class SimulationConfig(Section):
         "no_slip", description="condition of all walls, no_slip, slip or sticky, or of each wall (x_min, ...)"
     )
     contact: Literal["particles", "nodes", "released"] = Field(
-        "nodes",
+        "particles",
         description="contact of particles with the faces of the cube; wall nodes outside the cube, so that bodies rest "
         "near y = 0; or wall nodes inside, with clamped particles, as in the authors' released code",
     )

@@ -61,7 +61,7 @@ class MPM:
     dt: float
     gravity: tuple[float, float, float] = (0.0, -9.8, 0.0)
     boundary: str | Mapping[str, str] | tuple[str, ...] = "no_slip"
-    contact: str = "nodes"
+    contact: str = "particles"
     wall_cells: int = 1
     colliders: tuple[Collider, ...] = ()
 
