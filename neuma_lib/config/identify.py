@@ -27,12 +27,15 @@ class IdentifyConfig(Section):
     covariance_from: Literal["elastic", "total"] = internal("total", "as `training.covariance_from`")
     gaussian_motion: Literal["mean", "affine"] = internal("affine", "as `training.gaussian_motion`")
     frames: int = Field(33, ge=4, description="maximum number of frames, evenly spaced")
-    # Residuals of bodies with these particles measure the discretisation error.
+    # A second discretisation. Constants of the material are extrapolated from both.
     refined_particles: int = Field(
         8000,
         ge=0,
-        description="particles of the bodies that correct for the discretisation, more than `geometry.particles`; 0: "
-        "no correction",
+        description="particles of the bodies on the finer grid, more than `geometry.particles`; 0: no finer grid, and "
+        "no constants of the material",
+    )
+    refinement: int = internal(
+        2, "grid cells and steps of the finer grid, relative to the simulation's", ge=2
     )
     pose_tolerance: float = internal(1e-3, "expected shift [m] and enlargement of the rendered body", ge=0)
     resamplings: int = internal(

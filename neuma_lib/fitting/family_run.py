@@ -36,6 +36,8 @@ def _squares(residual: Iterable[Tensor]) -> float:
 class FamilyRun:
     """Fit of one family to the first `counts` frames of each video, with residuals and Jacobians for all levels.
 
+    Residuals are those of the finer discretisation where it has been measured, unless `corrected` is false.
+
     Unknowns are the unbounded constants relative to the start of the fit, and the deviations of the initial motion of
     each video. Residuals and their columns are lists over the observations of all videos.
     """
@@ -46,8 +48,10 @@ class FamilyRun:
         videos: Sequence[VideoResiduals],
         counts: Sequence[int],
         settings: IdentifyConfig,
+        corrected: bool = True,
     ):
         self.family, self.videos, self.counts, self.settings = family, videos, counts, settings
+        self._corrected = corrected
         self.alive, self.refined, self.rollouts, self.steps = False, False, 0, 0
         self.fit: Linearisation | None = None
         self._constants = len(family.constants)
@@ -139,13 +143,17 @@ class FamilyRun:
         return [self._own(v)[k] for k in self.videos[v].unsure]
 
     def measure_discretisation(self, derivatives: bool = False) -> None:
-        """Compute the discretisation correction, and optionally the derivatives by the deviations, at this fit."""
+        """Compute the correction to the finer discretisation, and optionally the derivatives by the deviations, here.
+
+        Other fits need `clear_cache` before they continue.
+        """
         law = self.family.law_spec(self.values)
         for v, video in enumerate(self.videos):
             here = Candidate(law, self._u[self._own(v)])
             if derivatives:
                 video.differentiate(here)
-            video.refine_particles(here)
+            video.measure_correction(here)
+        self.clear_cache()
 
     def clear_cache(self) -> None:
         """Drop cached residuals after a change of the discretisation correction."""
@@ -302,7 +310,9 @@ class FamilyRun:
         laws = [self.family.law_spec(self._values(point)) for point in points]
         residuals = [
             video.residuals(
-                [Candidate(law, p[self._own(v)]) for law, p in zip(laws, points, strict=True)], count
+                [Candidate(law, p[self._own(v)]) for law, p in zip(laws, points, strict=True)],
+                count,
+                self._corrected,
             )
             for v, (video, count) in enumerate(zip(self.videos, counts or self.counts, strict=True))
         ]

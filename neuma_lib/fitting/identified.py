@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,9 @@ from neuma_lib.config.identify import IdentifyConfig
 from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.fitting.families import Family
 from neuma_lib.mechanics.combinations import Values, named_combinations, physical
+
+REMAINDER = 0.5
+"""Standard deviation of an extrapolation to dx = 0, relative to its change of the constants."""
 
 
 @dataclass
@@ -57,6 +60,19 @@ class FamilyFit:
         for tie in ties:
             shared = {key: tie.values.get(key, value) for key, value in first.values.items()}
             self.covariance += np.outer(u(shared) - before, u(shared) - before) / (len(ties) + 1)
+
+    def extrapolated(self, coarse: FamilyFit, refinement: int) -> FamilyFit:
+        """This fit, of a grid of ``refinement`` times as many cells as another one's, extrapolated to dx = 0.
+
+        Unbounded constants are linear functions of dx. The covariance is increased by the square of the extrapolated
+        change, times `REMAINDER` squared.
+        """
+        u = self.family.unbounded
+        change = (u(self.values) - u(coarse.values)) / (refinement - 1)
+        covariance = None
+        if self.covariance is not None:
+            covariance = self.covariance + REMAINDER**2 * np.outer(change, change)
+        return replace(self, values=self.family.bounded(u(self.values) + change), covariance=covariance)
 
     def log_covariance(self, of: Callable[[Values], Values]) -> tuple[list[str], np.ndarray]:
         """Names (m,) and covariance (m, m) of logarithms of positive functions of the constants, to first order."""
@@ -122,12 +138,14 @@ class Identified:
     """Result of `identify`.
 
     Attributes:
-        best: the selected family, fitted to all frames.
+        best: the selected family, fitted to all frames on the grid of the simulation. It predicts on that grid.
         ties: names of other families with an equal score.
         fits: all candidates at their evaluation, by name.
         frames: steps of the fitted frames of each video.
         held_out: steps of the held-out frames of each video.
         rollouts: number of simulations, some of which families share.
+        material: the selected family with its constants extrapolated to a cell size of zero, for other simulators and
+            data sheets. None without a second grid.
     """
 
     best: FamilyFit
@@ -137,6 +155,7 @@ class Identified:
     held_out: list[tuple[int, ...]]
     rollouts: int
     settings: IdentifyConfig = field(repr=False)
+    material: FamilyFit | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Plain numbers for JSON; ``law`` is a specification for `analytic_law`."""
@@ -150,6 +169,7 @@ class Identified:
             "law": self.best.family.law_spec(self.best.values),
             "says": self.summary(),
             "best": self.best.as_dict(self.settings),
+            **({"material": self.material.as_dict(self.settings)} if self.material else {}),
             "families": {name: fit.as_dict(self.settings) for name, fit in self.fits.items()},
             **videos[0],
             **({"further_videos": videos[1:]} if videos[1:] else {}),
@@ -158,9 +178,12 @@ class Identified:
 
     def summary(self) -> str:
         """Summary line: family, constants, and determined quantities."""
-        fit = self.best
+        fit = self.material or self.best
         tied = f" (tie with {', '.join(self.ties)})" if self.ties else ""
         values = ", ".join(f"{key} = {value:.4g}" for key, value in fit.values.items())
+        if self.material:
+            on_grid = ", ".join(f"{key} = {value:.4g}" for key, value in self.best.values.items())
+            values = f"{values} of the material, {on_grid} on this grid"
         determined = {key: std < self.settings.determined for key, _, std in fit.quantities(self.settings)}
         lists = [
             f"{'determined' if wanted else 'not determined'}: {', '.join(names)}"

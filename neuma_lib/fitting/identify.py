@@ -17,6 +17,10 @@ block jackknife over the image and reported for combinations of constants, becau
 purely plastic flow determines the yield stress but not the stiffness. It is increased on plateaus of the loss, and by
 the disagreement of the last frames or of tied families.
 
+The selected family is fitted on two grids. On the finer one, the images are those of the coarse grid plus a correction,
+which is measured at the fit and again after it, so that only the coarse grid needs derivatives. The constants of the
+material follow by a linear extrapolation to a cell size of zero. Those of the coarse grid predict best on that grid.
+
 Several videos of one material share the constants, have one initial motion each, and equal weights.
 """
 
@@ -38,6 +42,9 @@ from neuma_lib.fitting.video_residuals import VideoResiduals
 from neuma_lib.mechanics.combinations import Values
 from neuma_lib.sim.model import MPM
 from neuma_lib.splatting.observation import Observation, joint_frames, several
+
+_CORRECTIONS = 2
+"""How often the correction to the finer discretisation is measured again at the fit to it."""
 
 
 def identify(
@@ -63,7 +70,7 @@ def identify(
             the views of the settings.
         settings: candidates and hyper-parameters.
         published: specification of the law of the scene's prior, an additional start, or None if unknown.
-        refined: for each video, resampled bodies with more particles for the discretisation correction, if any.
+        refined: for each video, resampled bodies with more particles for a finer grid, if any.
         other_videos: initial motion, body and observation of other videos of the same material.
         progress: called with (finished fits, number of fits, mean squared residual).
         log: receives a line for every family.
@@ -102,8 +109,8 @@ def identify(
         following = sorted((run for run in running if run.alive), key=lambda run: run.fit.cost)
         if following and level == rounds - 1:
             following[0].measure_discretisation(derivatives=True)
-            for run in following:
-                run.clear_cache()
+            for other in following:
+                other.clear_cache()
         for done, run in enumerate(following):
             run.refine(level)
             if progress:
@@ -117,19 +124,27 @@ def identify(
     selected, ties = _select(list(fits.values()), settings)
     run = next(run for run in running if run.family is selected.family)
     run.measure_discretisation()
-    final = FamilyRun(run.family, videos, [len(video.frames) for video in videos], settings)
     starts, first = [run.values], rounds - 1
     # If the first frames misled, restart at the coarsest level.
     if selected.held_out > settings.prune_factor * selected.loss:
         starts = [run.values, *(run.family.with_guesses(values) for values in ({}, published_values))]
         first = 0
-    final.begin(starts, first, run.deviations)
-    for level in range(first + 1, rounds if final.alive else 0):
-        final.refine(level)
-    best = final.score()
-    if best.covariance is not None:
-        best.covariance = final.inflated_covariance()
-        best.widen_by_ties(selected, [fits[name] for name in ties])
+    counts = [len(video.frames) for video in videos]
+    fine = FamilyRun(run.family, videos, counts, settings)
+    fine.begin(starts, first, run.deviations)
+    for level in range(first + 1, rounds if fine.alive else 0):
+        fine.refine(level)
+    tied = [fits[name] for name in ties]
+    if not any(resampled) or not fine.alive:
+        best, material = _widened(fine, selected, tied), None
+    else:
+        for _ in range(_CORRECTIONS):
+            fine.measure_discretisation()
+            fine.refine(rounds - 1)
+        coarse = FamilyRun(run.family, videos, counts, settings, corrected=False)
+        coarse.begin([fine.values], rounds - 1, fine.deviations)
+        best = _widened(coarse, selected, tied)
+        material = _widened(fine, selected, tied).extrapolated(best, settings.refinement)
     return Identified(
         best,
         ties,
@@ -138,7 +153,17 @@ def identify(
         [video.frames[video.fitted :] for video in videos],
         sum(video.rollouts for video in videos),
         settings,
+        material,
     )
+
+
+def _widened(run: FamilyRun, selected: FamilyFit, ties: Sequence[FamilyFit]) -> FamilyFit:
+    """The fit of a run to all frames, with an uncertainty that includes plateaus, parts of the video, and ties."""
+    fit = run.score()
+    if fit.covariance is not None:
+        fit.covariance = run.inflated_covariance()
+        fit.widen_by_ties(selected, ties)
+    return fit
 
 
 def _first_fit(

@@ -381,7 +381,7 @@ class TestTruth:
         assert own.frame_steps("BouncyBall") == loaded.frame_steps("BouncyBall")
 
     def test_the_refined_table_doubles_the_resolution_and_is_optional(self, loaded):
-        table = loaded.tables["finer_truth"]
+        table = loaded.tables["table1_converged"]
         assert not table.default_target and set(loaded.tables["table1"].methods) < set(table.methods)
         for name, scene in zip(table.scenes, loaded.tables["table1"].scenes, strict=True):
             refined, plain = loaded.scene_truth(name), loaded.scene_truth(scene)

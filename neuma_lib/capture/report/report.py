@@ -192,7 +192,7 @@ def _places(rows: Sequence[Mapping[str, Any]], own: str) -> list[dict[str, Any]]
 def _law(identified: Mapping[str, Any], scale: float) -> dict[str, Any]:
     """The identified family, its constants in units of the room, and the losses of all families."""
     constants = []
-    for name, entry in identified["best"]["quantities"].items():
+    for name, entry in identified.get("material", identified["best"])["quantities"].items():
         value, unit = room_value(name, entry["value"], scale)
         prefix, unit = prefixed(value, unit)
         value *= prefix
