@@ -281,7 +281,7 @@ def _of_method(options: argparse.Namespace) -> tuple[Law, dict[str, Any]]:
     case = cases.case(settings, scene, method)
     if not case.method.has_law:
         raise InputError(options.source, "its motion follows from no material law", "Choose another method")
-    law = case.source().load(lambda file: str(root / file)).law
+    law = case.source().load(lambda file: str(root / file)).exported
     origin = cases.law_origin(settings, scene, method)
     files = {"metrics": place / "metrics.json", "rollout": place / "rollout.h5"}
     of_this = {name: file for name, file in files.items() if file.is_file() and origin["scene"] == scene}

@@ -36,8 +36,8 @@ class DatasetConfig(Section):
     particles: int = Field(
         8000,
         gt=0,
-        description="particles of the ground truth, at least four times geometry.particles. Files have as many of a converged "
-        "truth",
+        description="particles of the ground truth, at least four times geometry.particles. Its file has at most as "
+        "many, drawn from those of a converged truth",
     )
     grid: Cells | Literal["converged"] | None = Field(
         None,

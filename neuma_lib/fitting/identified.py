@@ -144,6 +144,7 @@ class Identified:
         frames: steps of the fitted frames of each video.
         held_out: steps of the held-out frames of each video.
         rollouts: number of simulations, some of which families share.
+        grid: cells along the unit cube of the simulation.
         material: the selected family with its constants extrapolated to a cell size of zero, for other simulators and
             data sheets. None without a second grid.
     """
@@ -154,6 +155,7 @@ class Identified:
     frames: list[tuple[int, ...]]
     held_out: list[tuple[int, ...]]
     rollouts: int
+    grid: int
     settings: IdentifyConfig = field(repr=False)
     material: FamilyFit | None = None
 
@@ -165,6 +167,7 @@ class Identified:
         ]
         return {
             "family": self.best.family.name,
+            "grid": self.grid,
             "ties": self.ties,
             "law": self.best.family.law_spec(self.best.values),
             "says": self.summary(),

@@ -152,6 +152,7 @@ def identify(
         [video.frames[: video.fitted] for video in videos],
         [video.frames[video.fitted :] for video in videos],
         sum(video.rollouts for video in videos),
+        model.grid,
         settings,
         material,
     )

@@ -25,7 +25,12 @@ class Constants(Method):
         from neuma_lib.mechanics.analytic import analytic_law
         from neuma_lib.methods.model import LawOnGrid
 
-        return LawOnGrid(analytic_law(read_json(inputs["identified"])["law"], dt=dt))
+        identified = read_json(inputs["identified"])
+        law, material = analytic_law(identified["law"], dt=dt), None
+        if "material" in identified:
+            law.grid = identified.get("grid")
+            material = analytic_law(identified["material"]["law"], dt=dt)
+        return LawOnGrid(law, exported=material)
 
     def uncertainty_inputs(self, case: Case) -> Files:
         return self.model_inputs(case)

@@ -18,11 +18,16 @@ class MotionModel(ABC):
 
     Attributes:
         law: the material law that the motion follows from, None if there is none.
+        exported: that law for other simulators.
         stable: whether the fit ended without divergence.
     """
 
     law: Law | None = None
     stable: bool = True
+
+    @property
+    def exported(self) -> Law | None:
+        return self.law
 
     @abstractmethod
     def predict(
@@ -54,12 +59,24 @@ class LawOnGrid(MotionModel):
         laws: one law a body.
         counts: number of particles of each body. None: one body.
         stable: whether all fits ended without divergence.
+        exported: law of one body for other simulators. None: its law.
     """
 
-    def __init__(self, *laws: Law, counts: Sequence[int] | None = None, stable: bool = True):
+    def __init__(
+        self,
+        *laws: Law,
+        counts: Sequence[int] | None = None,
+        stable: bool = True,
+        exported: Law | None = None,
+    ):
         self.law = laws[0]
         self.stable = stable
+        self._exported = exported
         self._laws, self._counts = laws, counts
+
+    @property
+    def exported(self) -> Law:
+        return self._exported or self.law
 
     @classmethod
     def together(cls, models: Sequence[MotionModel], counts: Sequence[int]) -> MotionModel:

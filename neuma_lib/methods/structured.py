@@ -80,7 +80,11 @@ class Structured(Method):
         )
         run.log(chosen.summary())
         training.write_history(trained, chosen.as_dict())
-        about = {"settings": options, **training.report(trained)}
+        about = {
+            "settings": options,
+            "grid": problem.simulation["grid"],
+            **training.report(trained),
+        }
         save_adaptor(run.product, trained.law, settings.rank, settings.alpha, about)
         training.finish(trained)
 

@@ -6,7 +6,9 @@ gradient is one reverse loop over the stored states. The total deformation is an
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -19,6 +21,8 @@ from neuma_lib.sim.memory import DEFAULT_CACHE_BYTES, plan_memory
 from neuma_lib.sim.model import MPM, MaterialRegion, as_regions
 from neuma_lib.sim.simulation import Simulation, gather_weights
 from neuma_lib.sim.state import State, Trajectory
+
+_LOGGER = logging.getLogger(__name__)
 
 
 def rollout(
@@ -70,10 +74,25 @@ def rollout(
         given = f"shape {tuple(tracers.shape)} as {tracers.dtype}"
         raise InputError("tracers", f"{given} must be (M, 3) as {state.x.dtype}")
 
+    for region in regions:
+        if region.law.grid not in (None, model.grid):
+            _warn_of_another_grid(region.law.name, region.law.grid, model.grid)
     path, _ = fly_and_simulate(
         model, regions, state, frames, tracers, total, skip_free_flight, 1, scatter, memory, cache_bytes
     )
     return path
+
+
+@cache
+def _warn_of_another_grid(name: str, learned: int, used: int) -> None:
+    """Warn once that a law is used on another grid than the one whose discretisation error it has absorbed."""
+    _LOGGER.warning(
+        "law %r was learned on a grid of %d cells along the cube and is used on one of %d: its motion there differs by "
+        "the discretisation error that it has absorbed",
+        name,
+        learned,
+        used,
+    )
 
 
 def simulate(

@@ -6,7 +6,7 @@ from workflow.stage import run_script
 
 
 def main(inputs, output, params, run) -> None:
-    law = Prediction(inputs, params.method).law(params.origin["dt"])
+    law = Prediction(inputs, params.method).model(params.origin["dt"]).exported
     measured = {name: inputs.get(name) or None for name in ("metrics", "rollout")}
     known = {**params.origin, "commit": head_commit("."), **measured}
     about = export_law(output.law, law, page=output.page, **known)
