@@ -136,15 +136,15 @@ def identify(
         fine.refine(level)
     tied = [fits[name] for name in ties]
     if not any(resampled) or not fine.alive:
-        best, material = _widened(fine, selected, tied), None
+        best, material = _final_fit(fine, selected, tied), None
     else:
         for _ in range(_CORRECTIONS):
             fine.measure_discretisation()
             fine.refine(rounds - 1)
         coarse = FamilyRun(run.family, videos, counts, settings, corrected=False)
         coarse.begin([fine.values], rounds - 1, fine.deviations)
-        best = _widened(coarse, selected, tied)
-        material = _widened(fine, selected, tied).extrapolated(best, settings.refinement)
+        best = _final_fit(coarse, selected, tied)
+        material = _final_fit(fine, selected, tied).extrapolated(best, settings.refinement)
     return Identified(
         best,
         ties,
@@ -158,7 +158,7 @@ def identify(
     )
 
 
-def _widened(run: FamilyRun, selected: FamilyFit, ties: Sequence[FamilyFit]) -> FamilyFit:
+def _final_fit(run: FamilyRun, selected: FamilyFit, ties: Sequence[FamilyFit]) -> FamilyFit:
     """The fit of a run to all frames, with an uncertainty that includes plateaus, parts of the video, and ties."""
     fit = run.score()
     if fit.covariance is not None:

@@ -109,8 +109,13 @@ class VideoResiduals:
             pairs = zip(films, observed, strict=True)
             return _Discretisation(by, body, [Filmed(own, each, *options) for own, each in pairs])
 
-        finer = replace(model, grid=settings.refinement * model.grid, dt=model.dt / settings.refinement)
-        self._coarse, self._finer = discretised(model, body), [discretised(finer, each) for each in refined]
+        refined_model = replace(
+            model, grid=settings.refinement * model.grid, dt=model.dt / settings.refinement
+        )
+        self._coarse, self._refined = (
+            discretised(model, body),
+            [discretised(refined_model, each) for each in refined],
+        )
         sizes = [
             [max(1, round(each.cameras.width / across)) for across in settings.pyramid] for each in observed
         ]
@@ -179,11 +184,11 @@ class VideoResiduals:
 
     def measure_correction(self, at: Candidate) -> None:
         """Set the correction of all residuals to the finer discretisation, and its uncertainty by the particles."""
-        if not self._finer:
+        if not self._refined:
             return
         count = len(self.frames)
-        (coarse,), *finer = (self._simulated([at], count, each) for each in (self._coarse, *self._finer))
-        fine = [residual for (residual,) in finer if residual is not None]
+        (coarse,), *others = (self._simulated([at], count, each) for each in (self._coarse, *self._refined))
+        fine = [residual for (residual,) in others if residual is not None]
         if coarse is not None and fine:
             means = [torch.stack(of_all).mean(0) for of_all in zip(*fine, strict=True)]
             self._correction = _differences(means, coarse)
@@ -205,8 +210,8 @@ class VideoResiduals:
         frames = self._steps[: bisect_right(self._steps, self._last[count - 1])]
         starts = [self.motion.moved(one.deviations[:MOTION]).of_body(on.body) for one in candidates]
         laws = [analytic_law(one.law, on.model.dt).to(starts[0].x.device) for one in candidates]
-        finer = round(self.model.dt / on.model.dt)
-        options = dict(steps=finer * frames[-1], frames=[finer * n for n in frames], total=self._total)
+        substeps = round(self.model.dt / on.model.dt)
+        options = dict(steps=substeps * frames[-1], frames=[substeps * n for n in frames], total=self._total)
         paths = rollout_batch(on.model, laws, starts, **options)
         return [path and replace(path, frames=tuple(frames)) for path in paths]
 

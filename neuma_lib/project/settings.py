@@ -168,9 +168,9 @@ class Config(Section):
     def _truth(self, own: TruthConfig, dt: float, origin: str) -> TruthConfig:
         grid = own.grid or self.dataset.grid or self.simulation.grid
         if grid == CONVERGED:
-            finer = 2 * math.ceil(CONVERGED_CELLS / (2 * self.simulation.grid))
+            factor = 2 * math.ceil(CONVERGED_CELLS / (2 * self.simulation.grid))
             return TruthConfig(
-                grid=finer * self.simulation.grid, dt=own.dt or dt / finer, particles=own.particles
+                grid=factor * self.simulation.grid, dt=own.dt or dt / factor, particles=own.particles
             )
         step = own.dt or self.dataset.dt or dt
         substeps = round(dt / step)

@@ -380,15 +380,22 @@ class TestTruth:
         assert self.values(own.experiment_truth("letter_N_clay")) == (40, 2.5e-4, 9000)
         assert own.frame_steps("BouncyBall") == loaded.frame_steps("BouncyBall")
 
-    def test_the_refined_table_doubles_the_resolution_and_is_optional(self, loaded):
+    def test_the_converged_table_has_96_cells_and_is_optional(self, loaded, changed):
         table = loaded.tables["table1_converged"]
         assert not table.default_target and set(loaded.tables["table1"].methods) < set(table.methods)
         for name, scene in zip(table.scenes, loaded.tables["table1"].scenes, strict=True):
             refined, plain = loaded.scene_truth(name), loaded.scene_truth(scene)
-            assert refined.grid == 2 * plain.grid and refined.particles == 8 * plain.particles
-            assert plain.dt == 2 * refined.dt
+            assert refined.grid == 96 and refined.particles is None
+            assert plain.dt == pytest.approx(4 * refined.dt)
             assert loaded.scene(name).law == loaded.scene(scene).law
         assert not {*table.scenes, *loaded.random_scenes} & set(loaded.plain_scenes)
+        for grid, truth in ((32, 128), (36, 144), (48, 96)):
+            other = changed(simulation={"grid": grid}, random={"count": 0})
+            assert other.scene_truth(table.scenes[0]).grid == truth
+        everywhere = changed(dataset={"grid": "converged"})
+        assert (
+            everywhere.scene_truth("ClayCat").grid == everywhere.experiment_truth("letter_N_clay").grid == 96
+        )
 
     def test_laws_outside_every_family_are_in_no_prior_random_scene_or_other_table(self, loaded):
         table = loaded.tables["outside"]
