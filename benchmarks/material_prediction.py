@@ -2,10 +2,10 @@
 
 python -m benchmarks.material_prediction RubberPawn_converged ClayCat_converged [--grid 64] [--truth 128]
 
-In each scene with an identified.json, another shape of the same size falls on the floor at 3 m/s. Compared with the true
-law on the grid of the truth: the true law, the constants of the material, and those of the grid that they were fitted
-on, all on the grid of the prediction. Prints root mean square distances of 4,000 tracers over 25 frames [mm], and those
-of the material relative to the true law.
+In each scene with an identified.json, another shape of the same size falls on the floor at 3 m/s. Compared with the
+true law on the grid of the truth: the true law, the constants of the material, and those of the grid that they were
+fitted on, all on the grid of the prediction. Prints root mean square distances of 4,000 tracers over 25 frames [mm],
+and those of the material relative to the true law.
 """
 
 from __future__ import annotations

@@ -40,7 +40,7 @@ def export_law(
         separate_adaptor, any_time_step: see `save_law` and `about_law`.
         metrics, rollout: metrics.json and rollout.h5 of its method, or None.
         page: file for the picture of `neuma_lib.evaluation.law_page`.
-        known: further keys of `neuma_lib.io.exported`, except the grid, which is that of the law.
+        known: further keys of `neuma_lib.io.exported`.
 
     Returns:
         the metadata.
@@ -55,7 +55,7 @@ def export_law(
     if rollout is not None:
         arrays, _ = read_arrays(rollout, required=("F",), only=("F",))
         known["visited"] = visited_by(law, torch.from_numpy(arrays["F"]))
-    about = about_law(law, dt, any_time_step, **{**known, "grid": law.grid})
+    about = about_law(law, dt, any_time_step, **known)
     write_page = _drawn(law, about, page) if page else None
     save_law(path, law, about, separate_adaptor)
     if write_page is not None:

@@ -26,6 +26,7 @@ from neuma_lib.fitting.video_residuals import MOTION, NUISANCES, Candidate, Vide
 from neuma_lib.mechanics.combinations import Values
 
 _LAST_GAIN = 0.1  # factor on `min_gain` at the last level
+_CLOSE_GAIN = 1e-3  # the same of fits that are compared
 _MIN_LOSS = 1e-12  # held-out loss of images that agree exactly
 
 
@@ -117,8 +118,8 @@ class FamilyRun:
             self._u = unknowns
             self.refine(self._level)
 
-    def refine(self, level: int) -> None:
-        """Continue the fit at a level of the pyramid."""
+    def refine(self, level: int, closely: bool = False) -> None:
+        """Continue the fit at a level of the pyramid, ``closely`` until its constants are comparable between grids."""
         self._level, last = level, level == len(self.settings.pyramid) - 1
         unsure = [k for v, video in enumerate(self.videos) if video.by_deviation for k in self._unsure(v)]
         self._u, self.fit, steps = levenberg_marquardt(
@@ -126,7 +127,7 @@ class FamilyRun:
             self._u,
             [*range(self._constants), *unsure],
             self._prior,
-            self.settings.min_gain * (_LAST_GAIN if last else 1.0),
+            self.settings.min_gain * (_CLOSE_GAIN if closely else _LAST_GAIN if last else 1.0),
             self.settings.iterations,
             longest=self.settings.longest_step,
         )

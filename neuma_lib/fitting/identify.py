@@ -140,9 +140,10 @@ def identify(
     else:
         for _ in range(_CORRECTIONS):
             fine.measure_discretisation()
-            fine.refine(rounds - 1)
+            fine.refine(rounds - 1, closely=True)
         coarse = FamilyRun(run.family, videos, counts, settings, corrected=False)
         coarse.begin([fine.values], rounds - 1, fine.deviations)
+        coarse.refine(rounds - 1, closely=True)
         best = _final_fit(coarse, selected, tied)
         material = _final_fit(fine, selected, tied).extrapolated(best, settings.refinement)
     return Identified(

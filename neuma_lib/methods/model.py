@@ -18,7 +18,7 @@ class MotionModel(ABC):
 
     Attributes:
         law: the material law that the motion follows from, None if there is none.
-        exported: that law for other simulators.
+        exported: that law for other simulators, which holds on any grid if it is another object.
         stable: whether the fit ended without divergence.
     """
 

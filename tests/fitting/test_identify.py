@@ -31,7 +31,7 @@ from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 from neuma_lib.splatting.observation import Observation
 from tests.support.errors import refused
-from tests.support.grounding_scene import MODEL, RADIUS, ball, observe
+from tests.support.grounding_scene import MODEL, RADIUS, ball, camera, observe
 from tests.support.sim_scenes import law_spec as law
 
 pytestmark = pytest.mark.core
@@ -162,12 +162,15 @@ def test_videos_count_alike_however_long():
     assert losses[2] == pytest.approx((losses[0] + losses[1]) / 2, rel=0.02)
 
 
-def test_what_many_particles_change_is_added_and_its_scatter_is_uncertainty():
-    """The video is of a body of many particles: identified with few alone, the constants are those of another body.
-    With other fillings of many particles they are closer, and less certain than with a single filling."""
+def test_two_grids_give_the_constants_of_the_material():
+    """The video is of a body of many particles on a grid three times as fine as that of the fit.
+
+    Constants of the material are closer to the truth than those of the coarse grid alone, whose motion is not changed
+    by the second grid, and another filling of particles makes them less certain.
+    """
     truth, families = law("hencky", E=3e4, nu=0.35), {"hencky": ELASTIC}
     generator = torch.Generator().manual_seed(1)
-    few = ball(count=60)
+    few = ball(count=300)
 
     def filled(count):
         at = torch.randn(count, 3, generator=generator, dtype=torch.float64)
@@ -175,17 +178,35 @@ def test_what_many_particles_change_is_added_and_its_scatter_is_uncertainty():
         x = torch.tensor([0.5, 0.3, 0.5]) + radius * at / at.norm(dim=1, keepdim=True)
         return few.resampled(x, float(few.vol0.sum()), 1000.0)
 
-    many = filled(3000)
-    assert len(many.x0) >= 3000 and float(many.mass.sum()) == pytest.approx(float(few.mass.sum()))
-    seen, motion = observe(many, V0, FRAMES, truth), known(many)
+    many = filled(8000)
+    assert len(many.x0) >= 8000 and float(many.mass.sum()) == pytest.approx(float(few.mass.sum()))
+    finest = replace(MODEL, grid=3 * MODEL.grid, dt=MODEL.dt / 3)
+    path = rollout(
+        finest,
+        analytic_law(truth, finest.dt),
+        known(many).of_body(many),
+        steps=3 * FRAMES[-1],
+        frames=[3 * n for n in FRAMES],
+    )
+    cameras = camera(32, few.x0.dtype)
+    seen = Observation(FRAMES, many.particle_gs(cameras)(path.x, path.F), cameras)
     options = settings(families, covariance_from="elastic")
-    results = [
-        identify(MODEL, motion, few, seen, options, refined=[resampled] if resampled else ()).best
-        for resampled in ((), (filled(3000), filled(3000)))
-    ]
-    errors = [abs(math.log(fit.values["E"] / 3e4)) for fit in results]
-    assert errors[1] < errors[0] / 2
-    assert results[1].loss < results[0].loss / 2
+    one, both, two = (
+        identify(MODEL, known(few), few, seen, options, refined=[resampled] if resampled else ())
+        for resampled in ((), (filled(2400),), (filled(2400), filled(2400)))
+    )
+    error = {
+        name: abs(math.log(fit.values["E"] / 3e4))
+        for name, fit in (("alone", one.best), ("grid", two.best), ("material", two.material))
+    }
+    print(error, one.best.values, two.best.values, two.material.values, both.material.values)
+    assert one.material is None and error["material"] < error["alone"] / 2
+    assert two.best.values["E"] == pytest.approx(one.best.values["E"], rel=0.05)
+    stds = [np.sqrt(np.diag(fit.material.covariance)) for fit in (both, two)]
+    print(stds)
+    written = two.as_dict()
+    assert written["grid"] == MODEL.grid and written["law"] != written["material"]["law"]
+    assert "of the material" in written["says"]
 
 
 def test_a_motion_is_read_moved_and_written():

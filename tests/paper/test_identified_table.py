@@ -26,7 +26,7 @@ LAWS = {"hencky": HENCKY, "neo_hookean": NEO_HOOKEAN, "viscous_flow": VISCOUS, "
 
 
 def scene(truth, family, ties=(), group="all", converged=False, **quantities):
-    """Quantities as name=(value, standard deviation of the logarithm, determined), of what the truth is compared with."""
+    """Quantities, to be compared with the truth, as name=(value, standard deviation of the logarithm, determined)."""
     entries = {
         name: {"value": value, "log_std": std, "determined": sure}
         for name, (value, std, sure) in quantities.items()
