@@ -97,6 +97,14 @@ MISTAKES = [
     ({"scenes": {"New": {"like": ["BouncyBall"]}}}, "scenes.New.like"),
     ({"simulation": {"boundary": "no_slp"}}, "simulation.boundary"),
     ({"simulation": {"boundary": {"x_mn": "slip"}}}, "simulation.boundary"),
+    *[
+        ({"simulation": {"contact": contact, "boundary": boundary}}, "simulation.boundary")
+        for contact, boundary in [("nodes", 0.3), ("released", {"y_min": 0.3}), ("particles", "sticky")]
+    ],
+    *[
+        ({"simulation": {"contact": "particles", "boundary": {"y_min": boundary}}}, "simulation.boundary")
+        for boundary in (-0.1, True, "0.3", [1], float("nan"), float("inf"))
+    ],
     ({"scenes": {"BouncyBall": {"appearance": {"accent": "red"}}}}, "scenes.BouncyBall.appearance.accent"),
     ({"random": {"count": 1_000_000}}, "random.count"),
     ({"advanced": {"radiance.particles": 10**9}}, "radiance.particles"),
