@@ -96,6 +96,16 @@ class MPM:
         walls = unit_cube([_FRICTION.get(condition, condition) for condition in self.boundary])
         return (*walls, *self.colliders)
 
+    @property
+    def frictions(self) -> tuple[float, ...]:
+        """Coulomb coefficients of the obstacles."""
+        return tuple(obstacle.friction for obstacle in self.obstacles)
+
+    @property
+    def frictionless(self) -> MPM:
+        """The same model for all models that differ only in `frictions`."""
+        return self.with_friction(0.0) if self.contact == "particles" else self
+
     def with_friction(self, friction: float, given: bool = True) -> MPM:
         """This model with a Coulomb coefficient of all obstacles, or only of those that stick if not ``given``.
 
