@@ -93,8 +93,9 @@ class MPM:
         """Colliders of contact of particles: the six faces of the cube in the order of `WALLS`, then the others."""
         if self.contact != "particles":
             return ()
-        walls = unit_cube([_FRICTION.get(condition, condition) for condition in self.boundary])
-        return (*walls, *self.colliders)
+        conditions = _six_conditions(self.boundary, self.contact)
+        frictions = [_FRICTION[own] if isinstance(own, str) else own for own in conditions]
+        return (*unit_cube(frictions), *self.colliders)
 
     @property
     def frictions(self) -> tuple[float, ...]:
@@ -114,14 +115,12 @@ class MPM:
         """
         if self.contact != "particles":
             raise InputError("friction", f"needs contact of particles, not of {self.contact}")
-
-        def changed(own: Condition) -> Condition:
-            return friction if given or own in ("no_slip", math.inf) else own
-
+        changed = [friction if given or own == math.inf else own for own in self.frictions]
+        colliders = zip(self.colliders, changed[len(WALLS) :], strict=True)
         return replace(
             self,
-            boundary=tuple(map(changed, self.boundary)),
-            colliders=tuple(replace(each, friction=changed(each.friction)) for each in self.colliders),
+            boundary=tuple(changed[: len(WALLS)]),
+            colliders=tuple(replace(collider, friction=own) for collider, own in colliders),
         )
 
     @property
