@@ -17,6 +17,9 @@ block jackknife over the image and reported for combinations of constants, becau
 purely plastic flow determines the yield stress but not the stiffness. It is increased on plateaus of the loss, and by
 the disagreement of the last frames or of tied families.
 
+The Coulomb coefficient of the body and all its obstacles may be a constant of every family. Where the images also admit
+that the body sticks, the result is a lower bound of the coefficient.
+
 Several videos of one material share the constants, have one initial motion each, and equal weights.
 """
 
@@ -26,7 +29,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from neuma_lib.config.identify import IdentifyConfig
+from neuma_lib.config.identify import FRICTION_NEEDS, IdentifyConfig
 from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError, NonFiniteError
@@ -69,7 +72,8 @@ def identify(
         log: receives a line for every family.
 
     Raises:
-        InputError: fewer than four frames, none of them after a contact, no family, or one with unknown parts.
+        InputError: fewer than four frames, none of them after a contact, no family, or one with unknown parts, or
+            friction to be fitted without contact of particles.
         NonFiniteError: every family diverges from every start.
     """
     given = [(motion, body, observation), *other_videos]
@@ -82,7 +86,10 @@ def identify(
             "identify.families", "it has no candidates", "Add at least one elasticity with E and nu"
         )
     check_contact(model, ((one.of_body(each), joint_frames(several(video))) for one, each, video in given))
-    families = [Family(name, law.plain()) for name, law in settings.families.items()]
+    fits_friction = settings.contact_friction == "fitted"
+    if fits_friction and model.contact != "particles":
+        raise InputError("identify.contact_friction", *FRICTION_NEEDS)
+    families = [Family(name, law.plain(), fits_friction) for name, law in settings.families.items()]
     families.sort(key=lambda family: len(family.constants))  # simpler families provide starts of the others
     resampled = refined or [()] * len(given)
     videos = [VideoResiduals(model, *one, settings, own) for one, own in zip(given, resampled, strict=True)]
@@ -130,6 +137,8 @@ def identify(
     if best.covariance is not None:
         best.covariance = final.inflated_covariance()
         best.widen_by_ties(selected, [fits[name] for name in ties])
+        if fits_friction and (lowest := final.lowest_friction()) is not None:
+            best.stick(lowest)
     return Identified(
         best,
         ties,

@@ -42,10 +42,12 @@ class Candidate:
         law: specification of the law.
         deviations: deviations (9,) of velocity and spin from their estimates in standard deviations, then shift right,
             shift down and enlargement of the rendered body in units of the setting ``pose_tolerance``.
+        friction: Coulomb coefficient of all obstacles. None: those of the model.
     """
 
     law: Mapping[str, Mapping[str, Any]]
     deviations: np.ndarray
+    friction: float | None = None
 
 
 class VideoResiduals:
@@ -187,8 +189,12 @@ class VideoResiduals:
         frames = self._steps[: bisect_right(self._steps, self._last[count - 1])]
         starts = [self.motion.moved(one.deviations[:MOTION]).of_body(body) for one in candidates]
         laws = [analytic_law(one.law, self.model.dt).to(starts[0].x.device) for one in candidates]
+        models = [
+            self.model if one.friction is None else self.model.with_friction(one.friction)
+            for one in candidates
+        ]
         options = dict(steps=frames[-1], frames=frames, total=self._total)
-        return rollout_batch(self.model, laws, starts, **options)
+        return rollout_batch(models, laws, starts, **options)
 
     @torch.no_grad()
     def _residual(

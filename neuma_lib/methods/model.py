@@ -54,11 +54,21 @@ class LawOnGrid(MotionModel):
         laws: one law a body.
         counts: number of particles of each body. None: one body.
         stable: whether all fits ended without divergence.
+        friction: Coulomb coefficient of the body and its obstacles. None: those of the simulation, as for several
+            bodies together.
+        elsewhere: whether obstacles with a coefficient of their own keep it.
     """
 
-    def __init__(self, *laws: Law, counts: Sequence[int] | None = None, stable: bool = True):
+    def __init__(
+        self,
+        *laws: Law,
+        counts: Sequence[int] | None = None,
+        stable: bool = True,
+        friction: float | None = None,
+        elsewhere: bool = False,
+    ):
         self.law = laws[0]
-        self.stable = stable
+        self.stable, self.friction, self.elsewhere = stable, friction, elsewhere
         self._laws, self._counts = laws, counts
 
     @classmethod
@@ -71,6 +81,8 @@ class LawOnGrid(MotionModel):
         )
 
     def predict(self, mpm, state, frames, tracers=None, total=False):
+        if self.friction is not None:
+            mpm = mpm.with_friction(self.friction, given=not self.elsewhere)
         return predict(mpm, self._bodies(state), state, frames, tracers, total)
 
     def courant(self, mpm: MPM, state: State) -> float:
