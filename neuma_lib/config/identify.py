@@ -9,7 +9,6 @@ from pydantic import Field
 from neuma_lib.config.base import Compared, Section, internal
 from neuma_lib.config.laws import LawConfig
 
-
 FRICTION_NEEDS = "fitted needs contact of particles", "Set simulation.contact: particles"
 """Problem and remedy where friction is to be fitted with another contact."""
 

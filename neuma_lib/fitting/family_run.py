@@ -206,14 +206,15 @@ class FamilyRun:
         return whole[:k, :k]
 
     def lowest_friction(self) -> float | None:
-        """The smallest Coulomb coefficient that the images admit if they also admit sticking, else None.
+        """The smallest Coulomb coefficient that the images admit if they also admit sticking, else None, also if it is
+        not fitted.
 
         An admitted coefficient is at most `_EXCLUDED` standard deviations away. The distance follows from the
         jackknife with the difference between its images and those of the fit in place of the derivative.
         """
-        value = self.values[FRICTION]
-        if not self._admits([math.inf])[0]:
+        if not self.family.contact_friction or not self._admits([math.inf])[0]:
             return None
+        value = self.values[FRICTION]
         for factor in (_FRICTION_FACTOR, _FRICTION_FACTOR ** (1 / _FRICTIONS)):
             lower = [value / factor**n for n in range(1, _FRICTIONS + 1)]
             admitted = [*self._admits(lower), False].index(False)

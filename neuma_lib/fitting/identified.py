@@ -30,7 +30,7 @@ class FamilyFit:
         refined: whether the fit reached the finest level.
         rollouts: number of simulations.
         steps: number of accepted Levenberg-Marquardt steps.
-        lowest_friction: lower bound of the Coulomb coefficient of a body that sticks, which is no constant then.
+        lowest_friction: lower bound of the Coulomb coefficient of a body that sticks, whose family is without it.
     """
 
     family: Family
@@ -44,14 +44,6 @@ class FamilyFit:
     rollouts: int = 0
     steps: int = 0
     lowest_friction: float | None = None
-
-    def stick(self, lowest: float) -> None:
-        """Replace the constant `FRICTION` by a lower bound."""
-        self.lowest_friction = lowest
-        self.family = Family(self.family.name, self.family.spec)
-        self.values = {key: self.values[key] for key in self.family.constants}
-        k = len(self.values)
-        self.covariance = self.covariance[:k, :k]
 
     def contact_friction(self, settings: IdentifyConfig) -> dict[str, float]:
         """The fitted Coulomb coefficient of the body and its obstacles for JSON, empty if it was given.

@@ -133,12 +133,18 @@ def identify(
     final.begin(starts, first, run.deviations)
     for level in range(first + 1, rounds if final.alive else 0):
         final.refine(level)
+    lowest = final.lowest_friction() if final.alive else None
+    if lowest is not None:
+        for video in videos:
+            video.model = model.with_friction(math.inf)
+        sticking, start = Family(run.family.name, run.family.spec), (final.values, final.deviations)
+        final = FamilyRun(sticking, videos, [len(video.frames) for video in videos], settings)
+        final.begin(start[:1], rounds - 1, start[1])
     best = final.score()
+    best.lowest_friction = lowest
     if best.covariance is not None:
         best.covariance = final.inflated_covariance()
         best.widen_by_ties(selected, [fits[name] for name in ties])
-        if fits_friction and (lowest := final.lowest_friction()) is not None:
-            best.stick(lowest)
     return Identified(
         best,
         ties,
