@@ -85,6 +85,22 @@ def test_a_material_is_identified(scene):
         nm.identify(scene, families, {"particles": 100})
 
 
+def test_friction_is_identified_next_to_the_constants(scene):
+    """The ball, on a floor without friction, keeps its spin: the coefficient is a small number, or its logarithm is not
+    determined; `MPM.with_friction` takes it."""
+    rough = replace(MODEL, contact="particles")
+    body = scene.reconstruction
+    video = nm.Video((observe(body, V0, FRAMES, SOFT, size=24, model=rough.with_friction(0.2)),))
+    families = {"hencky": {"elasticity": {"name": "hencky", "E": 3e4, "nu": 0.3}}}
+    options = {"pyramid": (8, 24), "covariance_from": "elastic", "gaussian_motion": "mean"}
+    slippery = nm.Scene(rough, body, video, scene.motion)
+    material = nm.identify(slippery, families, {**options, "contact_friction": "fitted"})
+    assert set(material.constants) == set(material.std) == {"E", "nu"}
+    assert material.contact_friction["value"] == pytest.approx(0.2, rel=0.1)
+    assert material.contact_friction["log_std"] < 0.5
+    assert nm.identify(scene, families, {**options, "iterations": 1}).contact_friction == {}
+
+
 def test_the_default_families_are_those_of_the_shipped_settings():
     shipped = yaml.safe_load((ROOT / "config/config.yaml").read_text())["identify"]["families"]
     assert shipped == FAMILIES and list(shipped) == list(FAMILIES)

@@ -91,6 +91,11 @@ MISTAKES = [
     ({"advanced": {"identify.views": [0]}}, "advanced.identify.views"),
     ({"advanced": {"identify.spread": -2}}, "identify.spread"),
     ({"identify": {"spread": 2}}, "identify.spread"),
+    ({"identify": {"contact_friction": 0.3}}, "identify.contact_friction"),
+    (
+        {"identify": {"contact_friction": "fitted"}, "simulation": {"contact": "nodes"}},
+        "identify.contact_friction",
+    ),
     ({"gaussians": {"densification": {"every": 3}}}, "gaussians.densification.every"),
     ({"methods": 3}, "methods"),
     ({"extensions": ["os"]}, "extensions"),
