@@ -56,7 +56,7 @@ class LawOnGrid(MotionModel):
         stable: whether all fits ended without divergence.
         friction: Coulomb coefficient of the body and its obstacles. None: those of the simulation, as for several
             bodies together.
-        elsewhere: whether obstacles with a coefficient of their own keep it.
+        elsewhere: whether obstacles with a finite coefficient keep it.
     """
 
     def __init__(
