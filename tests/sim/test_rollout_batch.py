@@ -229,15 +229,19 @@ def test_constants_are_weights_so_that_graphs_serve_all():
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_the_gpu_agrees_also_when_it_replays(dtype):
-    """Three times, with other constants each time: run, recorded, replayed. One copy diverges in the second."""
+@pytest.mark.parametrize("contact", ["nodes", "particles"])
+def test_the_gpu_agrees_also_when_it_replays(dtype, contact):
+    """Three times, with other constants and friction each time: run, recorded, replayed. One copy diverges in the
+    second."""
     for stiffness in (1.0, 1.2, 0.8):
         laws = [law(name, stiffness) for name in FUSED]
         if stiffness == 1.2:
             laws[2] = analytic_law(UNSTABLE)
-        start = falling(dtype)
-        on_gpu = rollout_batch(MODEL, laws, start.to("cuda"), **RUN, total=True)
-        on_cpu = rollout_batch(MODEL, laws, start, **RUN, total=True)
+        start, models = falling(dtype), [MODEL] * len(laws)
+        if contact == "particles":
+            models = [SLIDING.with_friction(0.1 * copy * stiffness) for copy in range(len(laws))]
+        on_gpu = rollout_batch(models, laws, start.to("cuda"), **RUN, total=True)
+        on_cpu = rollout_batch(models, laws, start, **RUN, total=True)
         for actual, expected in zip(on_gpu, on_cpu, strict=True):
             assert (actual is None) == (expected is None)
             if actual:
