@@ -162,7 +162,7 @@ class Identification:
         std: standard deviations of the logarithms of the constants. Empty if they could not be estimated.
         ties: families that predict the held-out frames as well.
         contact_friction: ``value`` of the Coulomb coefficient and ``log_std``, the standard deviation of its logarithm,
-            or ``at_least`` if the body sticks. Empty if it was not fitted. `MPM.with_friction` applies it.
+            or ``at_least`` if the body may stick. Empty if it was not fitted. `MPM.with_friction` applies it.
     """
 
     law: Law

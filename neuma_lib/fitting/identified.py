@@ -30,7 +30,7 @@ class FamilyFit:
         refined: whether the fit reached the finest level.
         rollouts: number of simulations.
         steps: number of accepted Levenberg-Marquardt steps.
-        lowest_friction: lower bound of the Coulomb coefficient of a body that sticks, whose family is without it.
+        lowest_friction: lower bound of the Coulomb coefficient of a body that may stick, whose family is without it.
     """
 
     family: Family
@@ -48,8 +48,8 @@ class FamilyFit:
     def contact_friction(self, settings: IdentifyConfig) -> dict[str, float]:
         """The fitted Coulomb coefficient of the body and its obstacles for JSON, empty if it was given.
 
-        It is ``value`` with ``log_std``, the standard deviation of its logarithm, or ``at_least`` for a body that
-        sticks.
+        It is ``value`` with ``log_std``, the standard deviation of its logarithm, or ``at_least`` for a body that may
+        stick.
         """
         if self.lowest_friction is not None:
             return {"at_least": self.lowest_friction}
@@ -180,7 +180,7 @@ class Identified:
         tied = f" (tie with {', '.join(self.ties)})" if self.ties else ""
         values = ", ".join(f"{key} = {value:.4g}" for key, value in fit.values.items())
         if fit.lowest_friction is not None:
-            values += f", {FRICTION} >= {fit.lowest_friction:.2g} (sticks)"
+            values += f", {FRICTION} >= {fit.lowest_friction:.2g} (it may stick)"
         determined = {key: std < self.settings.determined for key, _, std in fit.quantities(self.settings)}
         lists = [
             f"{'determined' if wanted else 'not determined'}: {', '.join(names)}"
@@ -191,6 +191,6 @@ class Identified:
 
 
 def recorded_friction(identified: Mapping[str, Any]) -> float | None:
-    """Coulomb coefficient in the content of identified.json, infinite for a body that sticks. None: it was given."""
+    """Coulomb coefficient in the content of identified.json, infinite for a body that may stick. None: it was given."""
     record = identified.get(FRICTION)
     return None if record is None else record.get("value", math.inf)

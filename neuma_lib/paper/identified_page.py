@@ -64,6 +64,6 @@ def identified_page(identified: Mapping[str, Any], truth: Mapping[str, Mapping[s
     constants.axvline(1, color=style.LIGHT, zorder=0)
     tied = f", tie with {', '.join(identified['ties'])}" if identified["ties"] else ""
     lowest = identified.get("contact_friction", {}).get("at_least")
-    sticks = "" if lowest is None else f", sticks: contact_friction $\\geq$ {lowest:.2g}"
-    constants.set_title(identified["family"] + tied + sticks)
+    friction = "" if lowest is None else f", contact_friction at least {lowest:.2g}"
+    constants.set_title(identified["family"] + tied + friction)
     return figure

@@ -108,13 +108,14 @@ def test_a_body_that_sticks_gives_a_lower_bound(friction, tmp_path):
     assert set(result.best.values) == {"E", "nu"} and FRICTION not in content["best"]["quantities"]
     assert result.best.values["E"] == pytest.approx(6e4, rel=0.03)
     assert (
-        recorded_friction(content) == math.inf and f"{FRICTION} >= {lowest:.2g} (sticks)" in content["says"]
+        recorded_friction(content) == math.inf
+        and f"{FRICTION} >= {lowest:.2g} (it may stick)" in content["says"]
     )
     write_json(tmp_path / "identified.json", content)
     pytest.importorskip("matplotlib")
     from neuma_lib.paper.identified_page import identified_page
 
-    assert "sticks" in identified_page(content, law("hencky", **TRUTH)).axes[1].get_title()
+    assert "at least" in identified_page(content, law("hencky", **TRUTH)).axes[1].get_title()
 
 
 def test_a_given_coefficient_is_no_constant():
