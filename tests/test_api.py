@@ -79,10 +79,25 @@ def test_a_material_is_identified(scene):
     options = {"pyramid": (8, 24), "iterations": 4, "covariance_from": "elastic", "gaussian_motion": "mean"}
     material = nm.identify(scene, families, options)
     assert material.family == "hencky" and material.ties == () and set(material.std) == {"E", "nu"}
+    assert material.contact_friction == {}
     assert material.constants["E"] == pytest.approx(1.5e4, rel=0.1)
     assert float(material.law.elasticity.values["E"]) == material.constants["E"]
     with refused("options.particles"):
         nm.identify(scene, families, {"particles": 100})
+
+
+def test_friction_is_identified_next_to_the_constants(scene):
+    """A ball that slides before it rolls, in a video without noise."""
+    rough = replace(MODEL, contact="particles")
+    body = scene.reconstruction
+    video = nm.Video((observe(body, V0, FRAMES, SOFT, size=24, model=rough.with_friction(0.2)),))
+    families = {"hencky": {"elasticity": {"name": "hencky", "E": 3e4, "nu": 0.3}}}
+    options = {"pyramid": (8, 24), "covariance_from": "elastic", "gaussian_motion": "mean"}
+    slippery = nm.Scene(rough, body, video, scene.motion)
+    material = nm.identify(slippery, families, {**options, "contact_friction": "fitted"})
+    assert set(material.constants) == set(material.std) == {"E", "nu"}
+    assert material.contact_friction["value"] == pytest.approx(0.2, rel=0.1)
+    assert material.contact_friction["log_std"] < 0.5
 
 
 def test_the_default_families_are_those_of_the_shipped_settings():

@@ -9,6 +9,9 @@ from pydantic import Field
 from neuma_lib.config.base import Compared, Section, internal
 from neuma_lib.config.laws import LawConfig
 
+FRICTION_NEEDS = "fitted needs contact of particles", "Set simulation.contact: particles"
+"""Problem and remedy where friction is to be fitted with another contact."""
+
 
 class IdentifyConfig(Section):
     """Identification of the family and the constants of the material from the video, without training."""
@@ -26,6 +29,11 @@ class IdentifyConfig(Section):
     compare: Compared = Field("colour", description="compared quantity, as `training.compare`")
     covariance_from: Literal["elastic", "total"] = internal("total", "as `training.covariance_from`")
     gaussian_motion: Literal["mean", "affine"] = internal("affine", "as `training.gaussian_motion`")
+    contact_friction: Literal["given", "fitted"] = Field(
+        "given",
+        description="Coulomb coefficient of the body and its obstacles: that of the scene, or fitted to the video, "
+        "which needs `simulation.contact: particles`",
+    )
     frames: int = Field(33, ge=4, description="maximum number of frames, evenly spaced")
     # A second discretisation. Constants of the material are extrapolated from both.
     refined_particles: int = Field(

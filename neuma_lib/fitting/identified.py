@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from neuma_lib.config.identify import IdentifyConfig
 from neuma_lib.coupling.initial_motion import InitialMotion
-from neuma_lib.fitting.families import Family
+from neuma_lib.fitting.families import FRICTION, Family
 from neuma_lib.mechanics.combinations import Values, named_combinations, physical
 
 REMAINDER = 0.5
@@ -33,6 +33,7 @@ class FamilyFit:
         refined: whether the fit reached the finest level.
         rollouts: number of simulations.
         steps: number of accepted Levenberg-Marquardt steps.
+        lowest_friction: lower bound of the Coulomb coefficient of a body that may stick, whose family is without it.
     """
 
     family: Family
@@ -45,6 +46,18 @@ class FamilyFit:
     refined: bool = False
     rollouts: int = 0
     steps: int = 0
+    lowest_friction: float | None = None
+
+    def contact_friction(self, settings: IdentifyConfig) -> dict[str, float]:
+        """The fitted Coulomb coefficient of the body and its obstacles for JSON, empty if it was given.
+
+        It is ``value`` with ``log_std``, the standard deviation of its logarithm, or ``at_least`` for a body that may
+        stick.
+        """
+        if self.lowest_friction is not None:
+            return {"at_least": self.lowest_friction}
+        stds = {key: std for key, _, std in self.quantities(settings)}
+        return {"value": self.values[FRICTION], "log_std": stds[FRICTION]} if FRICTION in stds else {}
 
     def widen_by_ties(self, first: FamilyFit, ties: Sequence[FamilyFit]) -> None:
         """Increase the covariance by the disagreement of parts of the video and of families with equal scores.
@@ -160,16 +173,21 @@ class Identified:
     material: FamilyFit | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain numbers for JSON; ``law`` is a specification for `analytic_law`."""
+        """Plain numbers for JSON; ``law`` is a specification for `analytic_law`.
+
+        ``contact_friction`` is that of `FamilyFit.contact_friction` if it was fitted.
+        """
         videos = [
             {"start": motion.as_dict(), "frames": list(frames), "held_out_frames": list(held_out)}
             for motion, frames, held_out in zip(self.best.motions, self.frames, self.held_out, strict=True)
         ]
+        friction = self.best.contact_friction(self.settings)
         return {
             "family": self.best.family.name,
             "grid": self.grid,
             "ties": self.ties,
             "law": self.best.family.law_spec(self.best.values),
+            **({FRICTION: friction} if friction else {}),
             "says": self.summary(),
             "best": self.best.as_dict(self.settings),
             **({"material": self.material.as_dict(self.settings)} if self.material else {}),
@@ -187,6 +205,8 @@ class Identified:
         if self.material:
             on_grid = ", ".join(f"{key} = {value:.4g}" for key, value in self.best.values.items())
             values = f"{values} of the material, {on_grid} on this grid"
+        if fit.lowest_friction is not None:
+            values += f", {FRICTION} >= {fit.lowest_friction:.2g} (it may stick)"
         determined = {key: std < self.settings.determined for key, _, std in fit.quantities(self.settings)}
         lists = [
             f"{'determined' if wanted else 'not determined'}: {', '.join(names)}"
@@ -194,3 +214,9 @@ class Identified:
             if (names := [key for key, value in determined.items() if value == wanted])
         ]
         return f"{fit.family.name}{tied}: {values}; {'; '.join(lists)}"
+
+
+def recorded_friction(identified: Mapping[str, Any]) -> float | None:
+    """Coulomb coefficient in the content of identified.json, infinite for a body that may stick. None: it was given."""
+    record = identified.get(FRICTION)
+    return None if record is None else record.get("value", math.inf)

@@ -21,6 +21,9 @@ The selected family is fitted on two grids. On the finer one, the images are tho
 which is measured at the fit and again after it, so that only the coarse grid needs derivatives. The constants of the
 material follow by a linear extrapolation to a cell size of zero. Those of the coarse grid predict best on that grid.
 
+The Coulomb coefficient of the body and all its obstacles may be a constant of every family. Where the images also admit
+that the body sticks, the result is a lower bound of the coefficient.
+
 Several videos of one material share the constants, have one initial motion each, and equal weights.
 """
 
@@ -30,7 +33,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from neuma_lib.config.identify import IdentifyConfig
+from neuma_lib.config.identify import FRICTION_NEEDS, IdentifyConfig
 from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError, NonFiniteError
@@ -76,7 +79,8 @@ def identify(
         log: receives a line for every family.
 
     Raises:
-        InputError: fewer than four frames, none of them after a contact, no family, or one with unknown parts.
+        InputError: fewer than four frames, none of them after a contact, no family, or one with unknown parts, or
+            friction to be fitted without contact of particles.
         NonFiniteError: every family diverges from every start.
     """
     given = [(motion, body, observation), *other_videos]
@@ -89,7 +93,10 @@ def identify(
             "identify.families", "it has no candidates", "Add at least one elasticity with E and nu"
         )
     check_contact(model, ((one.of_body(each), joint_frames(several(video))) for one, each, video in given))
-    families = [Family(name, law.plain()) for name, law in settings.families.items()]
+    fits_friction = settings.contact_friction == "fitted"
+    if fits_friction and model.contact != "particles":
+        raise InputError("identify.contact_friction", *FRICTION_NEEDS)
+    families = [Family(name, law.plain(), fits_friction) for name, law in settings.families.items()]
     families.sort(key=lambda family: len(family.constants))  # simpler families provide starts of the others
     resampled = refined or [()] * len(given)
     videos = [VideoResiduals(model, *one, settings, own) for one, own in zip(given, resampled, strict=True)]
@@ -134,6 +141,13 @@ def identify(
     fine.begin(starts, first, run.deviations)
     for level in range(first + 1, rounds if fine.alive else 0):
         fine.refine(level)
+    lowest = fine.lowest_friction() if fine.alive else None
+    if lowest is not None:
+        for video in videos:
+            video.set_friction(math.inf)
+        sticking, start = Family(run.family.name, run.family.spec), (fine.values, fine.deviations)
+        fine = FamilyRun(sticking, videos, counts, settings)
+        fine.begin(start[:1], rounds - 1, start[1])
     tied = [fits[name] for name in ties]
     if not any(resampled) or not fine.alive:
         best, material = _final_fit(fine, selected, tied), None
@@ -141,11 +155,13 @@ def identify(
         for _ in range(_CORRECTIONS):
             fine.measure_discretisation()
             fine.refine(rounds - 1, closely=True)
-        coarse = FamilyRun(run.family, videos, counts, settings, corrected=False)
+        coarse = FamilyRun(fine.family, videos, counts, settings, corrected=False)
         coarse.begin([fine.values], rounds - 1, fine.deviations)
         coarse.refine(rounds - 1, closely=True)
         best = _final_fit(coarse, selected, tied)
         material = _final_fit(fine, selected, tied).extrapolated(best, settings.refinement)
+        material.lowest_friction = lowest
+    best.lowest_friction = lowest
     return Identified(
         best,
         ties,

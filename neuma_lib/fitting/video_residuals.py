@@ -43,13 +43,15 @@ class Candidate:
         law: specification of the law.
         deviations: deviations (9,) of velocity and spin from their estimates in standard deviations, then shift right,
             shift down and enlargement of the rendered body in units of the setting ``pose_tolerance``.
+        friction: Coulomb coefficient of all obstacles. None: those of the model.
     """
 
     law: Mapping[str, Mapping[str, Any]]
     deviations: np.ndarray
+    friction: float | None = None
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Discretisation:
     """Grid, time step and particles of simulations, and what renders them."""
 
@@ -129,6 +131,12 @@ class VideoResiduals:
             ])
             for each, filmed, size in zip(observed, self._coarse.films, self._finest, strict=True)
         ]  # fmt: skip
+
+    def set_friction(self, friction: float) -> None:
+        """Set the Coulomb coefficient of all obstacles in the simulations that follow."""
+        self.model = self.model.with_friction(friction)
+        for each in (self._coarse, *self._refined):
+            each.model = each.model.with_friction(friction)
 
     def counts(self, frames: int) -> list[int]:
         """Number of frames of each observation among the first ``frames`` of all."""
@@ -210,9 +218,12 @@ class VideoResiduals:
         frames = self._steps[: bisect_right(self._steps, self._last[count - 1])]
         starts = [self.motion.moved(one.deviations[:MOTION]).of_body(on.body) for one in candidates]
         laws = [analytic_law(one.law, on.model.dt).to(starts[0].x.device) for one in candidates]
+        models = [
+            on.model if one.friction is None else on.model.with_friction(one.friction) for one in candidates
+        ]
         substeps = round(self.model.dt / on.model.dt)
         options = dict(steps=substeps * frames[-1], frames=[substeps * n for n in frames], total=self._total)
-        paths = rollout_batch(on.model, laws, starts, **options)
+        paths = rollout_batch(models, laws, starts, **options)
         return [path and replace(path, frames=tuple(frames)) for path in paths]
 
     @torch.no_grad()

@@ -60,6 +60,9 @@ class LawOnGrid(MotionModel):
         counts: number of particles of each body. None: one body.
         stable: whether all fits ended without divergence.
         exported: law of one body for other simulators. None: its law.
+        friction: Coulomb coefficient of the body and its obstacles. None: those of the simulation, as for several
+            bodies together.
+        elsewhere: whether obstacles with a finite coefficient keep it.
     """
 
     def __init__(
@@ -68,9 +71,11 @@ class LawOnGrid(MotionModel):
         counts: Sequence[int] | None = None,
         stable: bool = True,
         exported: Law | None = None,
+        friction: float | None = None,
+        elsewhere: bool = False,
     ):
         self.law = laws[0]
-        self.stable = stable
+        self.stable, self.friction, self.elsewhere = stable, friction, elsewhere
         self._exported = exported
         self._laws, self._counts = laws, counts
 
@@ -88,6 +93,8 @@ class LawOnGrid(MotionModel):
         )
 
     def predict(self, mpm, state, frames, tracers=None, total=False):
+        if self.friction is not None:
+            mpm = mpm.with_friction(self.friction, given=not self.elsewhere)
         return predict(mpm, self._bodies(state), state, frames, tracers, total)
 
     def courant(self, mpm: MPM, state: State) -> float:

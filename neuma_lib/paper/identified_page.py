@@ -65,5 +65,7 @@ def identified_page(identified: Mapping[str, Any], truth: Mapping[str, Mapping[s
     constants.xaxis.set_minor_formatter(NullFormatter())
     constants.axvline(1, color=style.LIGHT, zorder=0)
     tied = f", tie with {', '.join(identified['ties'])}" if identified["ties"] else ""
-    constants.set_title(identified["family"] + tied)
+    lowest = identified.get("contact_friction", {}).get("at_least")
+    friction = "" if lowest is None else f", contact_friction at least {lowest:.2g}"
+    constants.set_title(identified["family"] + tied + friction)
     return figure

@@ -146,8 +146,10 @@ def fly_and_simulate(
     scatter: str | None = None,
     memory: float | None = None,
     cache_bytes: float | None = None,
+    frictions: Sequence[Sequence[float]] | None = None,
 ) -> tuple[Trajectory, list[NonFiniteError | None]]:
-    """`rollout` with checked arguments, for a state of several ``copies`` with equal numbers of particles.
+    """`rollout` with checked arguments, for a state of several ``copies`` with equal numbers of particles, and their
+    `MPM.frictions` if they differ.
 
     Returns one error per copy, or None. The states of a copy with an error are undefined. If all copies have one, the
     first is raised.
@@ -170,7 +172,9 @@ def fly_and_simulate(
         cache_bytes = DEFAULT_CACHE_BYTES[x.device.type] if cache_bytes is None else cache_bytes
         nodes = copies * model.nodes**3
         plan = plan_memory(steps, len(x), nodes, x.element_size(), cache_bytes, memory, total)
-    simulation = Simulation(model, regions, slices, state, steps, first, plan, scatter, total, copies)
+    simulation = Simulation(
+        model, regions, slices, state, steps, first, plan, scatter, total, copies, frictions
+    )
     *states, seen = RolloutFunction.apply(simulation, [n - first for n in frames], tracers, *inputs)
     path = Trajectory(frames, *states[:4], tracers=seen, F_total=states[4] if total else None)
     return path if flight is None else flight.followed_by(path), simulation.errors

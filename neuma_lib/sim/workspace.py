@@ -12,6 +12,7 @@ from collections.abc import Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
@@ -19,7 +20,7 @@ from torch import Tensor
 from neuma_lib.sim import kernels
 from neuma_lib.sim.adjoint_kernels import adjoint_kernels
 from neuma_lib.sim.colliders import contact_radius
-from neuma_lib.sim.contact_kernels import obstacle_type, obstacles
+from neuma_lib.sim.contact_kernels import STICKING, obstacle_type, obstacles
 from neuma_lib.sim.graphs import MAX_GRAPHS, GraphCache
 from neuma_lib.sim.kernels import NO_FAULT, forward_kernels, warp_types
 from neuma_lib.sim.model import MPM, WALLS
@@ -71,7 +72,9 @@ class Workspace:
         grid_v: velocity [m/s] of the nodes and 1 where there is mass, shape (n_cached_steps, copies * nodes^3, 4).
         mass, vol0: particle masses [kg] and initial volumes [m^3], shape (N,).
         radius: radii of the particles in contact [m], shape (N,).
-        obstacles: colliders at the steps of a segment, or at one step if none moves, shape (poses, colliders).
+        frictions: Coulomb coefficients of the colliders for each copy, shape (copies, colliders).
+        obstacles: colliders at the steps of a segment, or at one step if none moves, with the friction of each copy,
+            shape (poses * copies, colliders).
         faults: first step and particle with a non-finite value, with a move of more than a cell in a step, and
             outside the grid, shape (copies, 3).
         order: particles sorted by cell every `SORT_EVERY` steps, shape (n_sorts, N).
@@ -104,6 +107,7 @@ class Workspace:
         self.tau, self.F_trial = self._buffer((cached, N), "mat33"), self._buffer((cached, N), "mat33")
         self.grid, self.grid_v = self._buffer((cached, nodes), "vec4"), self._buffer((cached, nodes), "vec4")
         self.mass, self.vol0, self.radius = (self._buffer((N,), "real") for _ in range(3))
+        self.frictions = np.zeros((size.copies, len(size.model.obstacles)))
         self.obstacles = self._obstacles([0.0] * size.n_poses)
         self.faults = self._buffer((size.copies, 3), dtype=torch.int64)
         self.checkpoints = tuple(
@@ -147,26 +151,38 @@ class Workspace:
             _run(self._cells, self.at(step))
             self.order[self.sorted_at(step)].copy_(torch.sort(self.cells, stable=True).indices)
 
-    def load_particles(self, mass: Tensor, vol0: Tensor) -> None:
-        """Set masses [kg], volumes [m^3] and radii of the particles."""
+    def load_particles(self, mass: Tensor, vol0: Tensor, frictions: np.ndarray) -> None:
+        """Set masses [kg], volumes [m^3] and radii of the particles, and `frictions`."""
         self.mass.copy_(mass)
         self.vol0.copy_(vol0)
         self.radius.copy_(contact_radius(vol0))
+        self.frictions = frictions
+        if self.size.n_poses == 1:
+            self._load_obstacles([0.0])
 
     def pose_at(self, step: int) -> int:
-        """Row of the obstacles in a step."""
+        """Pose of the obstacles in a step."""
         return step % self.size.n_poses
 
     def load_poses(self, first: int, steps: int) -> None:
         """Set the obstacles at the steps of a segment that starts at step ``first`` of the simulation."""
         if self.size.n_poses > 1:
-            source = self._obstacles([self.size.model.dt * (first + n) for n in range(steps)])
-            wp.copy(self.obstacles, source, count=source.size)
+            self._load_obstacles([self.size.model.dt * (first + n) for n in range(steps)])
+
+    def _load_obstacles(self, times: Sequence[float]) -> None:
+        """Set the first rows of the obstacles."""
+        if self._contact:
+            with self.stream():
+                source = self._obstacles(times)
+                wp.copy(self.obstacles, source, count=source.size)
 
     def _obstacles(self, times: Sequence[float]) -> wp.array:
-        """Colliders at some times [s]."""
+        """Colliders at some times [s], with the friction of each copy."""
+        poses = obstacles(self.size.model.obstacles, times, self.size.dtype)
+        rows = np.repeat(poses, self.size.copies, axis=0)
+        rows["friction"] = np.tile(np.minimum(self.frictions, STICKING), (len(times), 1))
         return wp.array(
-            obstacles(self.size.model.obstacles, times, self.size.dtype),
+            rows,
             dtype=obstacle_type(self.size.dtype),
             device=wp.device_from_torch(self.size.device),
         )
@@ -372,7 +388,7 @@ def _run(launch: wp.Launch, *indices: int) -> None:
 def _grid_constants(size: WorkspaceSize):
     model, t = size.model, warp_types(size.dtype)
     c = t.GridConstants()
-    c.particles = size.particles // size.copies
+    c.particles, c.copies = size.particles // size.copies, size.copies
     c.n, c.wall_nodes, c.first = model.nodes, model.wall_nodes, model.first_node
     c.faces = len(WALLS) if model.contact == "particles" else 0
     c.walls = t.walls(*(_CONDITION_CODES[condition] for condition in model.boundary))

@@ -91,12 +91,25 @@ MISTAKES = [
     ({"advanced": {"identify.views": [0]}}, "advanced.identify.views"),
     ({"advanced": {"identify.spread": -2}}, "identify.spread"),
     ({"identify": {"spread": 2}}, "identify.spread"),
+    ({"identify": {"contact_friction": 0.3}}, "identify.contact_friction"),
+    (
+        {"identify": {"contact_friction": "fitted"}, "simulation": {"contact": "nodes"}},
+        "identify.contact_friction",
+    ),
     ({"gaussians": {"densification": {"every": 3}}}, "gaussians.densification.every"),
     ({"methods": 3}, "methods"),
     ({"extensions": ["os"]}, "extensions"),
     ({"scenes": {"New": {"like": ["BouncyBall"]}}}, "scenes.New.like"),
     ({"simulation": {"boundary": "no_slp"}}, "simulation.boundary"),
     ({"simulation": {"boundary": {"x_mn": "slip"}}}, "simulation.boundary"),
+    *[
+        ({"simulation": {"contact": contact, "boundary": boundary}}, "simulation.boundary")
+        for contact, boundary in [("nodes", 0.3), ("released", {"y_min": 0.3}), ("particles", "sticky")]
+    ],
+    *[
+        ({"simulation": {"contact": "particles", "boundary": {"y_min": boundary}}}, "simulation.boundary")
+        for boundary in (-0.1, True, "0.3", [1], float("nan"), float("inf"))
+    ],
     ({"scenes": {"BouncyBall": {"appearance": {"accent": "red"}}}}, "scenes.BouncyBall.appearance.accent"),
     ({"random": {"count": 1_000_000}}, "random.count"),
     ({"advanced": {"radiance.particles": 10**9}}, "radiance.particles"),
@@ -475,7 +488,7 @@ def test_page_and_schema_are_up_to_date():
 
 def test_page_and_schema_have_public_keys_alone():
     page, schema = settings_markdown(), json.loads(settings_schema())
-    assert page.count("\n| `") <= 200
+    assert page.count("\n| `") <= 201
     assert "| `penalty` |" in page and "| `spread` |" not in page
     known = schema["$defs"]["IdentifyConfig"]["properties"]
     assert "penalty" in known and "spread" not in known

@@ -273,11 +273,28 @@ def test_wrong_colliders_are_refused(settings, where):
         Collider(**settings)
 
 
+def test_walls_and_colliders_have_coefficients_of_their_own_or_one_in_common():
+    model = MPM(16, DT, contact="particles", boundary={"y_min": 0.3, "x_max": "slip", "z_min": math.inf})
+    model = replace(model, colliders=(SHAPES["box"], COLLIDERS["sticking"]))
+    own = [math.inf, 0.0, 0.3, math.inf, math.inf, math.inf, 0.4, math.inf]
+    assert [obstacle.friction for obstacle in model.obstacles] == own
+    assert {obstacle.friction for obstacle in model.with_friction(0.7).obstacles} == {0.7}
+    others = model.with_friction(0.7, given=False)
+    assert [each.friction for each in others.obstacles] == [0.7 if mu == math.inf else mu for mu in own]
+    assert model.with_friction(math.inf) == model.with_friction(0.7).with_friction(math.inf)
+    with refused("friction"):
+        MPM(16, DT).with_friction(0.3)
+
+
 def test_wrong_models_are_refused():
     with refused("colliders"):
         MPM(16, DT, colliders=(SHAPES["box"],))
-    with refused("boundary"):
-        MPM(16, DT, contact="particles", boundary="sticky")
+    for boundary in ("sticky", -0.1, math.nan, True, None, {"y_min": "0.3"}):
+        with refused("boundary"):
+            MPM(16, DT, contact="particles", boundary=boundary)
+    for contact in ("nodes", "released"):
+        with refused("boundary"):
+            MPM(16, DT, contact=contact, boundary={"y_min": 0.3})
     with refused("collider.normal"):
         Collider.plane((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     assert set(SIZES) == set(SHAPES)
