@@ -13,43 +13,13 @@ from neuma_lib.sim.free_flight import free_flight_steps
 from neuma_lib.sim.model import MPM, as_regions, contact_clearance
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
+from tests.support.contact_scenes import COLLIDERS, MOTION, SHAPES, falling_on, lattice
 from tests.support.errors import refused
-from tests.support.sim_scenes import (
-    DENSITY,
-    DT,
-    angular_momentum,
-    cube,
-    linear_momentum,
-    make_law,
-    moving_cube,
-)
+from tests.support.sim_scenes import DENSITY, DT, angular_momentum, linear_momentum, make_law, moving_cube
 
 pytestmark = pytest.mark.core
 
 GRAVITY = 9.8
-MOTION = {"velocity": (0.2, 0.5, -0.3), "spin": (1.0, -2.0, 3.0)}
-SHAPES = {
-    "plane": Collider.plane((0.5, 0.3, 0.5), (0.2, 1.0, -0.1), friction=0.3),
-    "box": Collider("box", (0.15, 0.1, 0.2), (0.45, 0.25, 0.5), (0.2, 0.4, -0.1), friction=0.4),
-    "sphere": Collider("sphere", (0.15,), (0.4, 0.22, 0.5), friction=0.3, damping=0.3),
-    "capsule": Collider("capsule", (0.2, 0.08), (0.5, 0.3, 0.5), (0.0, 0.3, 1.4), friction=0.5),
-}
-COLLIDERS = {
-    **SHAPES,
-    "sticking": replace(SHAPES["sphere"], friction=math.inf),
-    "frictionless": replace(SHAPES["box"], friction=0.0),
-    "moving": replace(SHAPES["box"], **MOTION, damping=0.2),
-}
-
-
-def falling_on(collider, **options):
-    """A model with a collider and an inclined plane, and a spinning cube 1 cm above them that slides to the side."""
-    model = MPM(14, DT, contact="particles", colliders=(collider, SHAPES["plane"]), **options)
-    x, mass, vol0 = cube(60, side=0.2, centre=(0.45, 0.7, 0.5))
-    while (clearance := float(contact_clearance(model, x, vol0))) > 0.0101:
-        x = x - (clearance - 0.01) * torch.tensor([0.0, 1.0, 0.0]).double()
-    velocity, spin = torch.tensor([[1.0, -1.5, 0.3], [3.0, -2.0, 4.0]]).double()
-    return model, State.rigid(x, mass, vol0, velocity, spin)
 
 
 def loss_of(path):
@@ -159,14 +129,6 @@ def test_free_flight_ends_where_the_body_touches(moving):
     assert strain[:free].max() < 1e-12 < strain[free + 2 :].max()
     skipped = rollout(model, law, start, steps=100, frames=(50, 100))
     torch.testing.assert_close(skipped.x, path.x[[50, 100]], rtol=0, atol=1e-9)
-
-
-def lattice(side, count, centre):
-    """A cube on a regular lattice: positions, masses and volumes."""
-    ticks = side * ((torch.arange(count) + 0.5) / count - 0.5).double()
-    x = torch.cartesian_prod(ticks, ticks, ticks) + torch.tensor(centre, dtype=torch.float64)
-    vol0 = torch.full((len(x),), side**3 / len(x), dtype=torch.float64)
-    return x, DENSITY * vol0, vol0
 
 
 @pytest.mark.parametrize("friction, angle", [(0.3, 30.0), (0.0, 30.0), (0.8, 30.0), (0.3, 10.0)])
