@@ -41,3 +41,18 @@ def lattice(side, count, centre):
     x = torch.cartesian_prod(ticks, ticks, ticks) + torch.tensor(centre, dtype=torch.float64)
     vol0 = torch.full((len(x),), side**3 / len(x), dtype=torch.float64)
     return x, DENSITY * vol0, vol0
+
+
+def sphere(radius, spacing, centre=(0.5, 0.5, 0.5)):
+    """A sphere on a jittered lattice: positions, masses and volumes. A perfect lattice would have facets.
+
+    Particles are balls of half the spacing, which the surface of the sphere surrounds.
+    """
+    reach = math.ceil(radius / spacing)
+    ticks = spacing * (torch.arange(-reach, reach) + 0.5).double()
+    x = torch.cartesian_prod(ticks, ticks, ticks)
+    noise = torch.rand(x.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 0.5
+    x = x + 0.5 * spacing * noise
+    x = x[x.norm(dim=1) < radius - 0.25 * spacing]
+    vol0 = torch.full((len(x),), 4 / 3 * math.pi * radius**3 / len(x), dtype=torch.float64)
+    return x + torch.tensor(centre, dtype=torch.float64), DENSITY * vol0, vol0
