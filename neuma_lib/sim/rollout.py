@@ -170,8 +170,8 @@ def fly_and_simulate(
     inputs = (*start, *weights)
     if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
         cache_bytes = DEFAULT_CACHE_BYTES[x.device.type] if cache_bytes is None else cache_bytes
-        nodes = copies * model.nodes**3
-        plan = plan_memory(steps, len(x), nodes, x.element_size(), cache_bytes, memory, total)
+        nodes, contact = copies * model.nodes**3, model.contact == "particles"
+        plan = plan_memory(steps, len(x), nodes, x.element_size(), cache_bytes, memory, total, contact)
     simulation = Simulation(
         model, regions, slices, state, steps, first, plan, scatter, total, copies, frictions
     )
