@@ -2,26 +2,90 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from neuma_lib.errors import InputError
-from neuma_lib.sim.state import cross_matrix
+from neuma_lib.sim.motion import Motion, Vector, vector
 
 SIZES = {"plane": (), "box": ("half width", "half height", "half depth"), "sphere": ("radius",)}
-SIZES["capsule"] = ("half length", "radius")
+SIZES |= {"capsule": ("half length", "radius"), "mesh": ()}
 """Lengths [m] that describe each shape. A plane fills y <= 0, a capsule extends along y, in the frame of the shape."""
 
 CONTACT_STIFFNESS = 0.5
 """Part of a penetration that contact removes in a time step. Any value from 0.1 to 1 is stable on every grid."""
 
 
+@dataclass(frozen=True, eq=False)
+class DistanceGrid:
+    """Signed distance to a closed surface at the nodes of a grid, negative inside. Equal if the numbers are.
+
+    Within a cell it is interpolated trilinearly. Outside the grid, whose outer nodes must be outside the surface, a
+    point at the distance a from the grid has the distance sqrt(a^2 + d^2), with the interpolated d of the nearest point
+    of the grid. That is a lower bound, exact next to a vertex of the surface.
+
+    Attributes:
+        values: distances [m], shape (I, J, K), at least two nodes along an axis.
+        lowest: position of the first node [m].
+        spacing: of the nodes [m].
+    """
+
+    values: np.ndarray
+    lowest: Vector
+    spacing: float
+    digest: bytes = field(init=False, repr=False)
+
+    def __post_init__(self):
+        values = np.array(self.values, np.float32)
+        values.setflags(write=False)
+        if values.ndim != 3 or min(values.shape) < 2 or not np.isfinite(values).all():
+            raise InputError("distances.values", f"shape {values.shape} must be (I, J, K) with finite values")
+        if min(values.take((0, -1), axis).min() for axis in range(3)) <= 0:
+            raise InputError("distances.values", "the surface leaves the grid", "Use a larger grid")
+        object.__setattr__(self, "values", values)
+        object.__setattr__(self, "lowest", vector(self.lowest, "distances.lowest"))
+        numbers = np.array([*values.shape, *self.lowest, self.spacing]).tobytes()
+        object.__setattr__(self, "digest", hashlib.sha256(numbers + values.tobytes()).digest())
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, DistanceGrid) and self.digest == other.digest
+
+    def __hash__(self) -> int:
+        return hash(self.digest)
+
+    def at(self, y: Tensor) -> tuple[Tensor, Tensor]:
+        """Distance (...,) [m] of points y (..., 3), and the direction (..., 3) of its gradient."""
+        values, nodes = torch.from_numpy(self.values.copy()).to(y), y.new_tensor(self.values.shape)
+        scaled = (y - y.new_tensor(self.lowest)) / self.spacing
+        within = scaled.clamp(torch.zeros_like(nodes), nodes - 1)
+        base = torch.minimum(within.detach().floor(), nodes - 2)
+        f, base = within - base, base.long()
+        distance, slope = 0.0, [0.0, 0.0, 0.0]
+        for corner in torch.cartesian_prod(*[torch.arange(2)] * 3).tolist():
+            value = values[tuple((base[..., a] + corner[a]) for a in range(3))]
+            weights = [f[..., a] if corner[a] else 1 - f[..., a] for a in range(3)]
+            distance = distance + weights[0] * weights[1] * weights[2] * value
+            for a in range(3):
+                rest = weights[a - 1] * weights[a - 2] * value
+                slope[a] = slope[a] + (rest if corner[a] else -rest)
+        gradient = torch.stack(slope, dim=-1) / self.spacing
+        beyond = (scaled - within) * self.spacing
+        outside = (beyond != 0).any(dim=-1)
+        length = torch.where(outside, (beyond**2).sum(dim=-1) + distance**2, 1.0).sqrt()
+        gradient = torch.where(
+            outside[..., None], torch.where(beyond != 0, beyond, distance[..., None] * gradient), gradient
+        )
+        return torch.where(outside, length, distance), gradient / gradient.norm(dim=-1, keepdim=True)
+
+
 @dataclass(frozen=True)
-class Collider:
+class Collider(Motion):
     """A rigid obstacle that particles touch.
 
     A particle of volume V0 is a ball of radius `contact_radius`. Where its gap g to the collider is negative, contact
@@ -43,8 +107,8 @@ class Collider:
         rotation: rotation vector of its frame at t = 0 [rad].
         friction: Coulomb coefficient. Infinity sticks.
         damping: part of the approaching velocity that an impulse removes, 0 (elastic) to 1.
-        velocity: of the centre [m/s].
-        spin: angular velocity about the centre [rad/s].
+        velocity, spin, keyframes: prescribed motion, see `Motion`.
+        distances: of a mesh (`geometry.mesh_collider`), in its frame.
 
     Raises:
         InputError: a value is out of range or unknown.
@@ -52,22 +116,27 @@ class Collider:
 
     shape: str
     size: tuple[float, ...] = ()
-    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    centre: Vector = (0.0, 0.0, 0.0)
+    rotation: Vector = (0.0, 0.0, 0.0)
     friction: float = math.inf
     damping: float = 0.0
-    velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    spin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    velocity: Vector = (0.0, 0.0, 0.0)
+    spin: Vector = (0.0, 0.0, 0.0)
+    keyframes: tuple[tuple[float, Vector, Vector], ...] = ()
+    distances: DistanceGrid | None = None
 
     def __post_init__(self):
         if self.shape not in SIZES:
             raise InputError("collider.shape", f"{self.shape!r} must be one of {', '.join(SIZES)}")
+        if (self.distances is not None) != (self.shape == "mesh"):
+            raise InputError("collider.distances", "must be given for the shape mesh and no other")
         lengths = SIZES[self.shape]
-        size = _numbers(self, "size", len(lengths), f"must be positive: {', '.join(lengths) or 'none'} [m]")
+        expected = f"must be positive: {', '.join(lengths) or 'none'} [m]"
+        size = vector(self.size, "collider.size", len(lengths), expected)
         if not all(length > 0 for length in size):
-            raise InputError("collider.size", f"{self.size!r} must be positive: {', '.join(lengths)} [m]")
-        for name in ("centre", "rotation", "velocity", "spin"):
-            _numbers(self, name, 3, "must be three finite numbers")
+            raise InputError("collider.size", f"{self.size!r} {expected}")
+        object.__setattr__(self, "size", size)
+        self.check_motion("collider")
         if not self.friction >= 0:
             raise InputError("collider.friction", f"{self.friction!r} must be a number of at least 0")
         if not 0 <= self.damping <= 1:
@@ -88,24 +157,6 @@ class Collider:
             axis = axis / axis.norm() * torch.arccos(n[1].clamp(-1, 1))
         return Collider("plane", (), tuple(point), tuple(axis.tolist()), **options)
 
-    @property
-    def moves(self) -> bool:
-        """Whether it has a velocity or a spin."""
-        return any((*self.velocity, *self.spin))
-
-    @property
-    def fastest(self) -> float:
-        """Upper bound of its speed [m/s] in the unit cube."""
-        reach = math.sqrt(3.0) + math.dist(self.centre, (0.5, 0.5, 0.5))
-        return math.hypot(*self.velocity) + math.hypot(*self.spin) * reach
-
-    def pose(self, time: float) -> tuple[Tensor, Tensor]:
-        """Axes (3, 3) of its frame as columns, and centre (3,) [m], both float64, at a time [s]."""
-        start = torch.linalg.matrix_exp(cross_matrix(_vector(self.rotation)))
-        turn = torch.linalg.matrix_exp(cross_matrix(time * _vector(self.spin))) if any(self.spin) else None
-        axes = start if turn is None else turn @ start
-        return axes, _vector(self.centre) + time * _vector(self.velocity)
-
     def surface(self, x: Tensor, time: float = 0.0) -> tuple[Tensor, Tensor]:
         """Signed distance (...,) [m] of points x (..., 3) to the surface, and outward normal (..., 3)."""
         axes, centre = (value.to(x) for value in self.pose(time))
@@ -119,6 +170,8 @@ class Collider:
             length = beyond.norm(dim=-1, keepdim=True)
             distance = torch.where((q > 0).any(dim=-1), length[..., 0], q.amax(dim=-1))
             normal = torch.where(y < 0, -1.0, 1.0) * beyond / length
+        elif self.distances is not None:
+            distance, normal = self.distances.at(y)
         else:
             half = self.size[0] if self.shape == "capsule" else 0.0
             up = x.new_tensor([0.0, 1.0, 0.0])
@@ -126,12 +179,6 @@ class Collider:
             length = q.norm(dim=-1, keepdim=True)
             distance, normal = length[..., 0] - self.size[-1], q / length
         return distance, normal @ axes.mT
-
-    def velocity_at(self, x: Tensor, time: float = 0.0) -> Tensor:
-        """Velocity of the collider [m/s] at points x (..., 3)."""
-        _, centre = self.pose(time)
-        spin = _vector(self.spin).to(x).expand_as(x)
-        return _vector(self.velocity).to(x) + torch.linalg.cross(spin, x - centre.to(x))
 
 
 def contact_radius(vol0: Tensor) -> Tensor:
@@ -149,20 +196,3 @@ def unit_cube(frictions: Sequence[float]) -> tuple[Collider, ...]:
         point = [float(upper and a == axis) for a in range(3)]
         faces.append(Collider.plane(point, normal, friction=friction))
     return tuple(faces)
-
-
-def _numbers(collider: Collider, name: str, count: int, problem: str) -> tuple[float, ...]:
-    """Store a field as that many finite numbers."""
-    value = getattr(collider, name)
-    try:
-        numbers = tuple(float(v) for v in value)
-    except (TypeError, ValueError):
-        numbers = ()
-    if len(numbers) != count or not all(map(math.isfinite, numbers)) or len(numbers) != len(value):
-        raise InputError(f"collider.{name}", f"{value!r} {problem}")
-    object.__setattr__(collider, name, numbers)
-    return numbers
-
-
-def _vector(value: Sequence[float]) -> Tensor:
-    return torch.tensor(value, dtype=torch.float64)

@@ -22,6 +22,8 @@ def free_flight_steps(
     Copies (see `kernels`) may have different velocities. The first contact of any copy ends free flight for all.
     """
     x, v, F, C = state.x, state.v, state.F, state.C
+    if model.clamps:
+        return 0
     if torch.is_grad_enabled() and (v.ndim == 2 and v.requires_grad or F.requires_grad or C.requires_grad):
         return 0
     with torch.no_grad():
@@ -62,7 +64,7 @@ def _clear_steps(model: MPM, x0: Tensor, v0: Tensor, vol0: Tensor, last: int) ->
         if distance <= 0:
             return n
         fastest = float(v0.norm(dim=-1).max() + clear * model.dt * gravity.norm()) + max(
-            collider.fastest for collider in model.colliders
+            collider.fastest(clear * model.dt) for collider in model.colliders
         )
         n += max(1, int(distance / (fastest * model.dt))) if fastest else clear
     return clear

@@ -19,8 +19,9 @@ from torch import Tensor
 
 from neuma_lib.sim import kernels
 from neuma_lib.sim.adjoint_kernels import adjoint_kernels
+from neuma_lib.sim.clamp_kernels import hold_type, holds
 from neuma_lib.sim.colliders import contact_radius
-from neuma_lib.sim.contact_kernels import STICKING, obstacle_type, obstacles
+from neuma_lib.sim.contact_kernels import STICKING, distances, obstacle_type, obstacles
 from neuma_lib.sim.graphs import MAX_GRAPHS, GraphCache
 from neuma_lib.sim.kernels import NO_FAULT, forward_kernels, warp_types
 from neuma_lib.sim.model import MPM, WALLS
@@ -51,7 +52,7 @@ class WorkspaceSize(NamedTuple):
     total: bool = False  # whether the state includes the total deformation
     copies: int = 1  # independent simulations with equal numbers of particles
     scatter: str = "atomic"  # scatter method
-    n_poses: int = 1  # steps of a segment if colliders move
+    n_poses: int = 1  # steps of a segment if colliders or clamps change
 
 
 class Workspace:
@@ -73,8 +74,12 @@ class Workspace:
         mass, vol0: particle masses [kg] and initial volumes [m^3], shape (N,).
         radius: radii of the particles in contact [m], shape (N,).
         frictions: Coulomb coefficients of the colliders for each copy, shape (copies, colliders).
-        obstacles: colliders at the steps of a segment, or at one step if none moves, with the friction of each copy,
+        obstacles: colliders at the steps of a segment, or at one step if none changes, with the friction of each copy,
             shape (poses * copies, colliders).
+        distances: values of the grids of colliders that are meshes.
+        holds: clamps at the steps of a segment, or at one step if none changes, shape (poses, clamps).
+        clamp: index of the clamp of each particle, or -1, shape (N,).
+        held_mass, held_by: mass of clamped particles at the nodes [kg], and the largest index of their clamps.
         faults: first step and particle with a non-finite value, with a move of more than a cell in a step, and
             outside the grid, shape (copies, 3).
         order: particles sorted by cell every `SORT_EVERY` steps, shape (n_sorts, N).
@@ -109,6 +114,15 @@ class Workspace:
         self.mass, self.vol0, self.radius = (self._buffer((N,), "real") for _ in range(3))
         self.frictions = np.zeros((size.copies, len(size.model.obstacles)))
         self.obstacles = self._obstacles([0.0] * size.n_poses)
+        self.distances = wp.array(
+            distances(size.model.obstacles),
+            dtype=warp_types(size.dtype).real,
+            device=wp.device_from_torch(size.device),
+        )
+        self.holds = self._holds([0.0] * size.n_poses)
+        self.clamp = self._buffer((N if size.model.clamps else 1,), dtype=torch.int32)
+        held = nodes if size.model.clamps else 1
+        self.held_mass, self.held_by = self._buffer((held,), "real"), self._buffer((held,), dtype=torch.int32)
         self.faults = self._buffer((size.copies, 3), dtype=torch.int64)
         self.checkpoints = tuple(
             value.new_empty(size.n_checkpoints, *value.shape[1:]) for value in self.carried
@@ -167,7 +181,11 @@ class Workspace:
     def load_poses(self, first: int, steps: int) -> None:
         """Set the obstacles at the steps of a segment that starts at step ``first`` of the simulation."""
         if self.size.n_poses > 1:
-            self._load_obstacles([self.size.model.dt * (first + n) for n in range(steps)])
+            times = [self.size.model.dt * (first + n) for n in range(steps)]
+            self._load_obstacles(times)
+            if self.size.model.clamps:
+                source = self._holds(times)
+                wp.copy(self.holds, source, count=source.size)
 
     def _load_obstacles(self, times: Sequence[float]) -> None:
         """Set the first rows of the obstacles."""
@@ -184,6 +202,15 @@ class Workspace:
         return wp.array(
             rows,
             dtype=obstacle_type(self.size.dtype),
+            device=wp.device_from_torch(self.size.device),
+        )
+
+    def _holds(self, times: Sequence[float]) -> wp.array:
+        """Clamps in the steps from some times [s] on."""
+        model, dtype = self.size.model, self.size.dtype
+        return wp.array(
+            holds(model.clamps, times, model.dt, dtype),
+            dtype=hold_type(dtype),
             device=wp.device_from_torch(self.size.device),
         )
 
@@ -218,13 +245,16 @@ class Workspace:
         """From tau and the state of a step to the velocities of the nodes."""
         cached = self.cached_at(step)
         self.grid[cached].zero_()
+        if self.size.model.clamps:
+            self.held_mass.zero_()
+            self.held_by.zero_()
         _run(self._p2g, self.at(step), cached, self.sorted_at(step), self.pose_at(step), self.at(step + 1))
-        _run(self._grid_update, cached)
+        _run(self._grid_update, cached, self.pose_at(step))
 
     def transfer_to_particles(self, step: int) -> None:
         """From velocities of the nodes to x, v, C and the total deformation after the step, and to F_trial."""
         now, after = self.at(step), self.at(step + 1)
-        _run(self._g2p, now, after, self.cached_at(step), step)
+        _run(self._g2p, now, after, self.cached_at(step), step, self.pose_at(step))
         if self.size.total:
             _run(self._total, now, after, after)
 
@@ -234,7 +264,7 @@ class Workspace:
 
     def tracer_launch(self, tracers: Tensor) -> wp.Launch:
         """A recorded launch, for `move_tracers`, that advects `tracers` (M, 3) in place."""
-        kernel = forward_kernels(self.size.dtype, self.size.scatter, self._contact).advect_tracers
+        kernel = forward_kernels(self.size.dtype, self.size.scatter, self._features).advect_tracers
         positions = wp.from_torch(tracers, dtype=warp_types(self.size.dtype).vec3)
         return self._record(kernel, len(tracers), 0, self._rows(self.grid_v), positions)
 
@@ -252,7 +282,7 @@ class Workspace:
         side = step % 2
         if self.size.total:
             _run(self._total_adjoint, now, after)
-        _run(self._g2p_adjoint, now, after, cached, side, self.sorted_at(step))
+        _run(self._g2p_adjoint, now, after, cached, side, self.sorted_at(step), self.pose_at(step))
         _run(self._grid_adjoint, cached, side)
         _run(self._p2g_adjoint, now, cached, side, self.pose_at(step))
 
@@ -298,6 +328,14 @@ class Workspace:
         return self.size.model.contact == "particles"
 
     @property
+    def _features(self) -> tuple[str, ...]:
+        """Features of the model for the kernels."""
+        meshes = any(collider.distances for collider in self.size.model.colliders)
+        return (
+            ("contact",) * self._contact + ("meshes",) * meshes + ("clamps",) * bool(self.size.model.clamps)
+        )
+
+    @property
     def _node_count(self) -> int:
         """Number of nodes of all copies."""
         return self.size.copies * self.size.model.nodes**3
@@ -309,19 +347,23 @@ class Workspace:
         return -(-N // BLOCK) * BLOCK if self.sorts else N
 
     def _record_forward(self) -> None:
-        k = forward_kernels(self.size.dtype, self.size.scatter, self._contact)
+        k = forward_kernels(self.size.dtype, self.size.scatter, self._features)
         N, nodes = self.size.particles, self._node_count
         rows, rows_v = self._rows(self.grid), self._rows(self.grid_v)
+        held = self.holds, self.clamp
         if self.sorts:
             self._cells = self._record(k.cells, N, 0, self.x, self.cells)
         self._p2g = self._record(
             k.p2g, self._scattering_threads, 0, 0, 0, 0, 0, self.order,
-            self.x, self.v, self.C, self.tau, self.mass, self.vol0, self.radius, self.obstacles, self.stuck, rows,
+            self.x, self.v, self.C, self.tau, self.mass, self.vol0, self.radius,
+            self.obstacles, self.distances, self.stuck, *held, self.held_mass, self.held_by, rows,
         )  # fmt: skip
-        self._grid_update = self._record(k.grid_update, nodes, 0, self.grid, self.grid_v)
+        self._grid_update = self._record(
+            k.grid_update, nodes, 0, 0, self.grid, self.grid_v, self.holds, self.held_mass, self.held_by
+        )
         self._g2p = self._record(
-            k.g2p, N, 0, 0, 0, 0,
-            rows_v, self.x, self.v, self.C, self.F, self.F_trial, self.faults,
+            k.g2p, N, 0, 0, 0, 0, 0,
+            rows_v, self.x, self.v, self.C, self.F, self.F_trial, *held, self.faults,
         )  # fmt: skip
         self._trial = self._record(k.trial_deformation, N, 0, 0, 0, self.C, self.F, self.F_trial)
         if self.size.total:
@@ -329,18 +371,20 @@ class Workspace:
             self._total = self._record(k.trial_deformation, N, 0, 0, 0, self.C, F_total, F_total)
 
     def _record_adjoint(self) -> None:
-        k = adjoint_kernels(self.size.dtype, self.size.scatter, self._contact)
+        k = adjoint_kernels(self.size.dtype, self.size.scatter, self._features)
         N, nodes = self.size.particles, self._node_count
         rows_v, grad_rows = self._rows(self.grid_v), self._rows(self.grad_grid)
+        held = self.holds, self.clamp
         self._g2p_adjoint = self._record(
-            k.g2p_adjoint, self._scattering_threads, 0, 0, 0, 0, 0, self.order,
+            k.g2p_adjoint, self._scattering_threads, 0, 0, 0, 0, 0, 0, self.order,
             self.x, self.v, self.C, self.F, rows_v,
-            self.grad_v, self.grad_C, self.grad_F_trial, self.grad_x, self.grad_F, grad_rows,
+            self.grad_v, self.grad_C, self.grad_F_trial, self.grad_x, self.grad_F, *held, grad_rows,
         )  # fmt: skip
         self._grid_adjoint = self._record(k.grid_adjoint, nodes, 0, 0, self.grid, self.grad_grid)
         self._p2g_adjoint = self._record(
             k.p2g_adjoint, N, 0, 0, 0, 0,
-            self.x, self.v, self.C, self.tau, self.mass, self.vol0, self.radius, self.obstacles, self.stuck, grad_rows,
+            self.x, self.v, self.C, self.tau, self.mass, self.vol0, self.radius,
+            self.obstacles, self.distances, self.stuck, *held, grad_rows,
             self.grad_x, self.grad_v, self.grad_C, self.grad_tau, self.grad_stuck,
         )  # fmt: skip
         if self.size.total:
@@ -395,6 +439,6 @@ def _grid_constants(size: WorkspaceSize):
     c.dx, c.inv_dx, c.dt = model.dx, float(model.grid), model.dt
     c.gravity = t.vec3(*model.gravity)
     low, high = model.stencil_range
-    c.clamp_low, c.clamp_high = (low, high) if model.clamps else (-math.inf, math.inf)
+    c.clamp_low, c.clamp_high = (low, high) if model.bounds_positions else (-math.inf, math.inf)
     c.leave_low, c.leave_high = low - LEAVING * model.dx, high + LEAVING * model.dx
     return c
