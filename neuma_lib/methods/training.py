@@ -16,9 +16,9 @@ from neuma_lib.io.files import listed, write_json
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.images import load_videos
 from neuma_lib.io.particles import load_reconstruction, with_motion
+from neuma_lib.io.simulator import simulator
 from neuma_lib.mechanics.adaptor import AdaptableLaw
 from neuma_lib.methods.base import Files, FitRun, Problem
-from neuma_lib.sim.model import MPM
 from neuma_lib.splatting.observation import Observation
 
 
@@ -60,7 +60,7 @@ class Training:
                 for body, file in zip(bodies, listed(inputs["transforms"]), strict=True)
             ]
         frames = [loss.frames for loss in self.losses]
-        check_contact(MPM(**problem.simulation), zip(self.starts, frames, strict=True))
+        check_contact(simulator(problem.simulation), zip(self.starts, frames, strict=True))
         files = {
             f"{name} {k}": file for name, value in inputs.items() for k, file in enumerate(listed(value))
         }
@@ -78,7 +78,7 @@ class Training:
 
     def problem(self, law: AdaptableLaw) -> tuple:
         """Positional arguments of `train_material`."""
-        return MPM(**self._problem.simulation), law, self.starts[0], self.losses[0], self.settings
+        return simulator(self._problem.simulation), law, self.starts[0], self.losses[0], self.settings
 
     def options(self) -> dict[str, Any]:
         """Keyword arguments of `train_material`."""

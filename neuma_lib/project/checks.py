@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from neuma_lib.config.scenes import is_mesh_file
+from neuma_lib.config.obstacles import is_mesh_file
 from neuma_lib.config.validation import hint
 from neuma_lib.errors import InputError
 from neuma_lib.mechanics.catalogue import COURANT_LIMIT, DEFINED_IN, check_law, longitudinal_modulus

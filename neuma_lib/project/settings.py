@@ -152,6 +152,16 @@ class Config(Section):
         gravity = [0.0, -GRAVITY * captured.scale, 0.0]  # all lengths of the room are scaled
         return {"grid": captured.grid or self.captures.grid, "gravity": gravity}
 
+    def obstacles(self, name: str) -> dict[str, Any]:
+        """Colliders of the simulations of a scene or an experiment, for `neuma_lib.io.simulator`. Empty without any."""
+        base, _ = self.replicate(name)
+        colliders = None
+        if base in self.experiments:
+            colliders, base = self.experiments[base].colliders, self.experiments[base].bodies[0].scene
+        if colliders is None:
+            colliders = self.scenes[base].colliders
+        return {"colliders": [each.arguments() for each in colliders]} if colliders else {}
+
     def scene_truth(self, name: str) -> TruthConfig:
         """Resolution of the ground truth of a scene, without null values."""
         scene = self.scene(name)

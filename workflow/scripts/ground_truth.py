@@ -7,14 +7,14 @@ from neuma_lib.device import choose_device
 from neuma_lib.geometry.shapes import place
 from neuma_lib.io.files import listed
 from neuma_lib.io.hdf5 import write_arrays
+from neuma_lib.io.simulator import simulator
 from neuma_lib.mechanics.analytic import analytic_law
-from neuma_lib.sim.model import MPM
 from workflow.inputs import solid
 from workflow.stage import run_script
 
 
 def main(inputs, output, params, run) -> None:
-    model = MPM(**params.simulation)
+    model = simulator(params.simulation)
     meshes = iter(listed(inputs.meshes))
     bodies = [
         TrueBody(
