@@ -52,6 +52,10 @@ class ColliderConfig(Section):
     )
     velocity: Vector = Field((0.0, 0.0, 0.0), description="velocity of the centre [m/s]")
     spin: Vector = Field((0.0, 0.0, 0.0), description="angular velocity about the centre [rad/s]")
+    keyframes: tuple[tuple[float, Vector, Vector], ...] = Field(
+        (),
+        description="motion in place of velocity and spin: [time [s], centre [m], rotation vector [rad]] of each frame",
+    )
 
     @model_validator(mode="after")
     def _shape_is_whole(self) -> ColliderConfig:

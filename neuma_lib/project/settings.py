@@ -21,6 +21,7 @@ from neuma_lib.config.figures import FiguresConfig
 from neuma_lib.config.gaussians import GaussiansConfig
 from neuma_lib.config.geometry import GeometryConfig
 from neuma_lib.config.identify import IdentifyConfig
+from neuma_lib.config.obstacles import ColliderConfig
 from neuma_lib.config.photographs import PhotographsConfig
 from neuma_lib.config.priors import PriorsConfig
 from neuma_lib.config.scenes import SceneConfig
@@ -153,14 +154,19 @@ class Config(Section):
         return {"grid": captured.grid or self.captures.grid, "gravity": gravity}
 
     def obstacles(self, name: str) -> dict[str, Any]:
-        """Colliders of the simulations of a scene or an experiment, for `neuma_lib.io.simulator`. Empty without any."""
-        base, _ = self.replicate(name)
-        colliders = None
-        if base in self.experiments:
-            colliders, base = self.experiments[base].colliders, self.experiments[base].bodies[0].scene
-        if colliders is None:
-            colliders = self.scenes[base].colliders
+        """Arguments of `neuma_lib.io.simulator.simulator` of a scene or an experiment that not all have, plain."""
+        _, colliders = self.colliders(name)
         return {"colliders": [each.arguments() for each in colliders]} if colliders else {}
+
+    def colliders(self, name: str) -> tuple[str, tuple[ColliderConfig, ...]]:
+        """Path of the key with the colliders of a scene or an experiment, and them."""
+        base, _ = self.replicate(name)
+        if base in self.experiments:
+            own = self.experiments[base]
+            if own.colliders is not None:
+                return f"experiments.{base}.colliders", own.colliders
+            base = own.bodies[0].scene
+        return f"scenes.{base}.colliders", self.scenes[base].colliders
 
     def scene_truth(self, name: str) -> TruthConfig:
         """Resolution of the ground truth of a scene, without null values."""

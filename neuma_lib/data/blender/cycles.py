@@ -142,6 +142,44 @@ def _grain_nodes(radius: float, material: bpy.types.Material) -> bpy.types.NodeT
     return tree
 
 
+class Obstacles:
+    """Rigid grey objects of a job, which cast shadows in pictures and none in images with masks.
+
+    The colours of the body in the images then do not depend on obstacles, and their masks end where an obstacle hides
+    the body.
+    """
+
+    GREY = (0.2, 0.22, 0.25, 1.0)
+
+    def __init__(self, job: dict[str, np.ndarray], shadows: bool):
+        material = bpy.data.materials.new("obstacle")
+        material.use_nodes = True
+        nodes, links = material.node_tree.nodes, material.node_tree.links
+        nodes.clear()
+        diffuse, output = nodes.new("ShaderNodeBsdfDiffuse"), nodes.new("ShaderNodeOutputMaterial")
+        diffuse.inputs["Color"].default_value = self.GREY
+        links.new(diffuse.outputs["BSDF"], output.inputs["Surface"])
+        self.poses, self.objects = job["obstacle_poses"], []
+        for k in range(len(self.poses)):
+            mesh = bpy.data.meshes.new("obstacle")
+            mesh.from_pydata(job[f"obstacle_{k}_vertices"].tolist(), [], job[f"obstacle_{k}_faces"].tolist())
+            mesh.materials.append(material)
+            each = bpy.data.objects.new("obstacle", mesh)
+            each.visible_shadow = each.visible_diffuse = shadows
+            bpy.context.scene.collection.objects.link(each)
+            self.objects.append(each)
+
+    def show(self, frame: int) -> None:
+        """Set the poses of a frame."""
+        for each, poses in zip(self.objects, self.poses, strict=True):
+            each.matrix_world = Matrix(poses[frame].tolist())
+
+    def cut_out(self, transparent: bool) -> None:
+        """Whether obstacles are transparent, and hide the body nevertheless."""
+        for each in self.objects:
+            each.is_holdout = transparent
+
+
 class Body:
     """The object of a job, with the geometry of one frame."""
 
