@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from neuma_lib.errors import InputError
-from neuma_lib.sim.state import cross_matrix
+from neuma_lib.sim.motion import Motion, Vector, vector
 
 SIZES = {"plane": (), "box": ("half width", "half height", "half depth"), "sphere": ("radius",)}
 SIZES["capsule"] = ("half length", "radius")
@@ -21,7 +21,7 @@ CONTACT_STIFFNESS = 0.5
 
 
 @dataclass(frozen=True)
-class Collider:
+class Collider(Motion):
     """A rigid obstacle that particles touch.
 
     A particle of volume V0 is a ball of radius `contact_radius`. Where its gap g to the collider is negative, contact
@@ -43,8 +43,7 @@ class Collider:
         rotation: rotation vector of its frame at t = 0 [rad].
         friction: Coulomb coefficient. Infinity sticks.
         damping: part of the approaching velocity that an impulse removes, 0 (elastic) to 1.
-        velocity: of the centre [m/s].
-        spin: angular velocity about the centre [rad/s].
+        velocity, spin, keyframes: prescribed motion, see `Motion`.
 
     Raises:
         InputError: a value is out of range or unknown.
@@ -52,22 +51,24 @@ class Collider:
 
     shape: str
     size: tuple[float, ...] = ()
-    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    centre: Vector = (0.0, 0.0, 0.0)
+    rotation: Vector = (0.0, 0.0, 0.0)
     friction: float = math.inf
     damping: float = 0.0
-    velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    spin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    velocity: Vector = (0.0, 0.0, 0.0)
+    spin: Vector = (0.0, 0.0, 0.0)
+    keyframes: tuple[tuple[float, Vector, Vector], ...] = ()
 
     def __post_init__(self):
         if self.shape not in SIZES:
             raise InputError("collider.shape", f"{self.shape!r} must be one of {', '.join(SIZES)}")
         lengths = SIZES[self.shape]
-        size = _numbers(self, "size", len(lengths), f"must be positive: {', '.join(lengths) or 'none'} [m]")
+        expected = f"must be positive: {', '.join(lengths) or 'none'} [m]"
+        size = vector(self.size, "collider.size", len(lengths), expected)
         if not all(length > 0 for length in size):
-            raise InputError("collider.size", f"{self.size!r} must be positive: {', '.join(lengths)} [m]")
-        for name in ("centre", "rotation", "velocity", "spin"):
-            _numbers(self, name, 3, "must be three finite numbers")
+            raise InputError("collider.size", f"{self.size!r} {expected}")
+        object.__setattr__(self, "size", size)
+        self.check_motion("collider")
         if not self.friction >= 0:
             raise InputError("collider.friction", f"{self.friction!r} must be a number of at least 0")
         if not 0 <= self.damping <= 1:
@@ -87,24 +88,6 @@ class Collider:
         else:
             axis = axis / axis.norm() * torch.arccos(n[1].clamp(-1, 1))
         return Collider("plane", (), tuple(point), tuple(axis.tolist()), **options)
-
-    @property
-    def moves(self) -> bool:
-        """Whether it has a velocity or a spin."""
-        return any((*self.velocity, *self.spin))
-
-    @property
-    def fastest(self) -> float:
-        """Upper bound of its speed [m/s] in the unit cube."""
-        reach = math.sqrt(3.0) + math.dist(self.centre, (0.5, 0.5, 0.5))
-        return math.hypot(*self.velocity) + math.hypot(*self.spin) * reach
-
-    def pose(self, time: float) -> tuple[Tensor, Tensor]:
-        """Axes (3, 3) of its frame as columns, and centre (3,) [m], both float64, at a time [s]."""
-        start = torch.linalg.matrix_exp(cross_matrix(_vector(self.rotation)))
-        turn = torch.linalg.matrix_exp(cross_matrix(time * _vector(self.spin))) if any(self.spin) else None
-        axes = start if turn is None else turn @ start
-        return axes, _vector(self.centre) + time * _vector(self.velocity)
 
     def surface(self, x: Tensor, time: float = 0.0) -> tuple[Tensor, Tensor]:
         """Signed distance (...,) [m] of points x (..., 3) to the surface, and outward normal (..., 3)."""
@@ -127,12 +110,6 @@ class Collider:
             distance, normal = length[..., 0] - self.size[-1], q / length
         return distance, normal @ axes.mT
 
-    def velocity_at(self, x: Tensor, time: float = 0.0) -> Tensor:
-        """Velocity of the collider [m/s] at points x (..., 3)."""
-        _, centre = self.pose(time)
-        spin = _vector(self.spin).to(x).expand_as(x)
-        return _vector(self.velocity).to(x) + torch.linalg.cross(spin, x - centre.to(x))
-
 
 def contact_radius(vol0: Tensor) -> Tensor:
     """Radius of a particle in contact [m], half the spacing of particles: V0^(1/3) / 2."""
@@ -149,20 +126,3 @@ def unit_cube(frictions: Sequence[float]) -> tuple[Collider, ...]:
         point = [float(upper and a == axis) for a in range(3)]
         faces.append(Collider.plane(point, normal, friction=friction))
     return tuple(faces)
-
-
-def _numbers(collider: Collider, name: str, count: int, problem: str) -> tuple[float, ...]:
-    """Store a field as that many finite numbers."""
-    value = getattr(collider, name)
-    try:
-        numbers = tuple(float(v) for v in value)
-    except (TypeError, ValueError):
-        numbers = ()
-    if len(numbers) != count or not all(map(math.isfinite, numbers)) or len(numbers) != len(value):
-        raise InputError(f"collider.{name}", f"{value!r} {problem}")
-    object.__setattr__(collider, name, numbers)
-    return numbers
-
-
-def _vector(value: Sequence[float]) -> Tensor:
-    return torch.tensor(value, dtype=torch.float64)

@@ -53,10 +53,11 @@ def obstacles(colliders: Sequence[Collider], times: Sequence[float], dtype: torc
         column["size"][:, : len(collider.size)] = collider.size
         for n, time in enumerate(times if collider.moves else times[:1]):
             axes, centre = collider.pose(time)
-            place = slice(n, n + 1 if collider.moves else None)
-            column["axes"][place], column["centre"][place] = axes.numpy(), centre.numpy()
-        for name in ("velocity", "spin", "damping"):
-            column[name] = getattr(collider, name)
+            velocity, spin = collider.rates(time)
+            pose = {"axes": axes, "centre": centre, "velocity": velocity, "spin": spin}
+            for name, value in pose.items():
+                column[name][slice(n, n + 1 if collider.moves else None)] = value.numpy()
+        column["damping"] = collider.damping
         column["friction"] = min(collider.friction, STICKING)
     return result
 

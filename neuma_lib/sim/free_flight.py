@@ -62,7 +62,7 @@ def _clear_steps(model: MPM, x0: Tensor, v0: Tensor, vol0: Tensor, last: int) ->
         if distance <= 0:
             return n
         fastest = float(v0.norm(dim=-1).max() + clear * model.dt * gravity.norm()) + max(
-            collider.fastest for collider in model.colliders
+            collider.fastest(clear * model.dt) for collider in model.colliders
         )
         n += max(1, int(distance / (fastest * model.dt))) if fastest else clear
     return clear
