@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any
 
 from pydantic import Field, model_validator
@@ -29,10 +30,10 @@ def is_mesh_file(shape: str | None) -> bool:
 
 
 class ColliderConfig(Section):
-    """A rigid obstacle. The faces of the cube are obstacles too, with the friction of `simulation.boundary`.
+    """A rigid obstacle, in addition to the faces of the cube.
 
-    Sizes [m] are none for a plane, the half width, height and depth of a box, the radius of a sphere, half the length
-    without its ends and the radius of a capsule, and the longest side of a mesh.
+    Its size [m] is: none for a plane, which fills the space below; half width, height and depth of a box; radius of a
+    sphere; half the length without the ends, and radius of a capsule; longest side of a mesh.
     """
 
     shape: str = Field(
@@ -54,7 +55,8 @@ class ColliderConfig(Section):
     spin: Vector = Field((0.0, 0.0, 0.0), description="angular velocity about the centre [rad/s]")
     keyframes: tuple[tuple[float, Vector, Vector], ...] = Field(
         (),
-        description="motion in place of velocity and spin: [time [s], centre [m], rotation vector [rad]] of each frame",
+        description="poses in place of centre, rotation, velocity and spin: time [s], centre [m] and rotation vector "
+        "[rad] of each",
     )
 
     @model_validator(mode="after")
@@ -73,19 +75,33 @@ class ColliderConfig(Section):
             raise InputError("axis", "[0, 0, 0] is no direction", "Give for example [0, 1, 0]")
         if any(self.rotation) and self.axis != UP:
             raise InputError("axis", "a rotation is given, too", "Give one of the two")
+        times = [time for time, _, _ in self.keyframes]
+        if any(after <= before for before, after in pairwise(times)):
+            raise InputError("keyframes", f"times {times} s must ascend")
+        placed = (*self.centre, *self.rotation, *self.velocity, *self.spin)
+        if times and (self.axis != UP or any(placed)):
+            problem = "exclude centre, axis, rotation, velocity and spin"
+            raise InputError("keyframes", problem, "Leave those out")
         return self
+
+    @property
+    def start(self) -> tuple[Vector, Vector]:
+        """Centre [m] and rotation vector [rad] at t = 0, or in the first key frame."""
+        if self.keyframes:
+            return self.keyframes[0][1:]
+        return self.centre, self.rotation if self.axis == UP else turned_up(self.axis)
 
     def arguments(self) -> dict[str, Any]:
         """Arguments of a collider, which JSON can hold. Those at their defaults are left out."""
         given = self.model_dump(mode="json", exclude_defaults=True, exclude={"axis"})
-        return given | ({"rotation": turned_up(self.axis)} if self.axis != UP else {})
+        return given | ({"rotation": list(self.start[1])} if self.axis != UP else {})
 
 
-def turned_up(axis: Sequence[float]) -> list[float]:
+def turned_up(axis: Sequence[float]) -> Vector:
     """The shortest rotation vector [rad] from the y axis to a direction."""
     x, y, z = (component / math.hypot(*axis) for component in axis)
     sine = math.hypot(x, z)
     if sine < 1e-12:  # any axis in the plane turns y to -y
-        return [0.0 if y > 0 else math.pi, 0.0, 0.0]
+        return (0.0 if y > 0 else math.pi), 0.0, 0.0
     angle = math.atan2(sine, y)
-    return [angle * z / sine, 0.0, -angle * x / sine]
+    return angle * z / sine, 0.0, -angle * x / sine

@@ -225,8 +225,9 @@ def _contains(collider: ColliderConfig, point: np.ndarray) -> bool:
     """Whether a point [m] is inside a collider at t = 0. Meshes are checked when the truth is simulated."""
     from scipy.spatial.transform import Rotation
 
-    turn = Rotation.from_rotvec(collider.arguments().get("rotation", (0.0, 0.0, 0.0)))
-    y, size = turn.inv().apply(point - np.array(collider.centre)), np.array(collider.size)
+    centre, rotation = collider.start
+    y = Rotation.from_rotvec(rotation).inv().apply(point - np.array(centre))
+    size = np.array(collider.size)
     if collider.shape == "plane":
         return y[1] < 0
     if collider.shape == "box":

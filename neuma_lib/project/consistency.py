@@ -56,7 +56,6 @@ def _section_errors(settings: Config, root: str | Path) -> Iterator[InputError]:
     for name, experiment in settings.experiments.items():
         if all(body.scene in settings.scenes for body in experiment.bodies):
             yield from _raised_by(settings.experiment_truth, name)
-            yield from _contact_errors(settings, name)
     yield from _sampling_errors(settings)
 
 
@@ -113,18 +112,7 @@ def _scene_errors(settings: Config, name: str) -> Iterator[InputError]:
     changed = {**settings.training.plain(), **scene.training}
     yield from _raised_by(validate, type(settings.training), changed, f"scenes.{name}.training")
     yield from _raised_by(settings.scene_truth, name)
-    yield from _contact_errors(settings, name)
     yield from _video_errors(settings, name)
-
-
-def _contact_errors(settings: Config, name: str) -> Iterator[InputError]:
-    """Obstacles of a scene or an experiment are touched by particles."""
-    where, colliders = settings.colliders(name)
-    if colliders and settings.simulation.contact != "particles":
-        problem = (
-            f"obstacles need contact of particles, and simulation.contact is {settings.simulation.contact}"
-        )
-        yield InputError(where, problem, "Set simulation.contact: particles")
 
 
 def prior_errors(settings: Config, name: str) -> Iterator[InputError]:

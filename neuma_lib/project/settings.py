@@ -154,9 +154,10 @@ class Config(Section):
         return {"grid": captured.grid or self.captures.grid, "gravity": gravity}
 
     def obstacles(self, name: str) -> dict[str, Any]:
-        """Arguments of `neuma_lib.io.simulator.simulator` of a scene or an experiment that not all have, plain."""
+        """Plain arguments of `neuma_lib.io.simulator.simulator` of a scene or an experiment with obstacles."""
         _, colliders = self.colliders(name)
-        return {"colliders": [each.arguments() for each in colliders]} if colliders else {}
+        plain = [each.arguments() for each in colliders]
+        return {"contact": "particles", "colliders": plain} if plain else {}
 
     def colliders(self, name: str) -> tuple[str, tuple[ColliderConfig, ...]]:
         """Path of the key with the colliders of a scene or an experiment, and them."""
