@@ -82,7 +82,6 @@ def test_videos_of_one_law_share_their_obstacles(with_colliders, changed):
     with refused("scenes.Steps.videos", problem="colliders"):
         changed(scenes={"Steps": {"like": "BouncyBall", "videos": [{"colliders": [STEP]}]}})
     again = changed(
-        **PARTICLES,
         scenes={"Steps": {"like": "BouncyBall", "colliders": [STEP], "videos": [{"velocity": [0, 0, 1]}]}},
     )
     assert again.obstacles("Steps_throw2") == again.obstacles("Steps")
