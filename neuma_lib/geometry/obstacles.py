@@ -10,23 +10,29 @@ import trimesh
 
 from neuma_lib.sim.colliders import Collider
 
+GREY = (0.49, 0.51, 0.54)
+"""Colour of colliders, sRGB."""
 PLANE_REACH = 0.75
 """Half the side of the square that stands for a plane [m]: the faces of the unit cube with a margin."""
 
 
 @dataclass(frozen=True)
 class Obstacle:
-    """A rigid surface in motion.
+    """A rigid matte surface in motion.
 
     Attributes:
         vertices: in its own frame [m], shape (V, 3).
         faces: shape (M, 3), outward.
         poses: from its frame to the world at each time, shape (T, 4, 4) [m].
+        color: sRGB in [0, 1].
+        opacity: less than 1 shows what is behind it.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     poses: np.ndarray
+    color: tuple[float, float, float] = GREY
+    opacity: float = 1.0
 
     @property
     def moves(self) -> bool:

@@ -149,25 +149,31 @@ class Obstacles:
     the body.
     """
 
-    GREY = (0.2, 0.22, 0.25, 1.0)
-
     def __init__(self, job: dict[str, np.ndarray], shadows: bool):
-        material = bpy.data.materials.new("obstacle")
-        material.use_nodes = True
-        nodes, links = material.node_tree.nodes, material.node_tree.links
-        nodes.clear()
-        diffuse, output = nodes.new("ShaderNodeBsdfDiffuse"), nodes.new("ShaderNodeOutputMaterial")
-        diffuse.inputs["Color"].default_value = self.GREY
-        links.new(diffuse.outputs["BSDF"], output.inputs["Surface"])
         self.poses, self.objects = job["obstacle_poses"], []
-        for k in range(len(self.poses)):
+        for k, (*color, opacity) in enumerate(job["obstacle_colors"].tolist()):
             mesh = bpy.data.meshes.new("obstacle")
             mesh.from_pydata(job[f"obstacle_{k}_vertices"].tolist(), [], job[f"obstacle_{k}_faces"].tolist())
-            mesh.materials.append(material)
+            mesh.materials.append(self._material(color, opacity))
             each = bpy.data.objects.new("obstacle", mesh)
             each.visible_shadow = each.visible_diffuse = shadows
             bpy.context.scene.collection.objects.link(each)
             self.objects.append(each)
+
+    @staticmethod
+    def _material(color: list[float], opacity: float) -> bpy.types.Material:
+        material = bpy.data.materials.new("obstacle")
+        material.use_nodes = True
+        nodes, links = material.node_tree.nodes, material.node_tree.links
+        nodes.clear()
+        diffuse, clear = nodes.new("ShaderNodeBsdfDiffuse"), nodes.new("ShaderNodeBsdfTransparent")
+        mix, output = nodes.new("ShaderNodeMixShader"), nodes.new("ShaderNodeOutputMaterial")
+        diffuse.inputs["Color"].default_value = (*color, 1.0)
+        mix.inputs["Fac"].default_value = opacity
+        for shader, place in ((clear, 1), (diffuse, 2)):
+            links.new(shader.outputs["BSDF"], mix.inputs[place])
+        links.new(mix.outputs["Shader"], output.inputs["Surface"])
+        return material
 
     def show(self, frame: int) -> None:
         """Set the poses of a frame."""

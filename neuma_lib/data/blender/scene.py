@@ -151,6 +151,7 @@ def render_images(
             device=device,
             matte=matte,
             obstacle_poses=np.array([each.poses for each in obstacles]),
+            obstacle_colors=np.array([(*linear(each.color), each.opacity) for each in obstacles]),
             **{f"obstacle_{k}_vertices": each.vertices for k, each in enumerate(obstacles)},
             **{f"obstacle_{k}_faces": each.faces for k, each in enumerate(obstacles)},
         )
