@@ -19,10 +19,13 @@ from neuma_lib.sim.scatter import scatter_functions
 
 
 @functools.cache
-def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic", contact: bool = False) -> SimpleNamespace:
+def adjoint_kernels(
+    dtype: torch.dtype, scatter: str = "atomic", features: tuple[str, ...] = ()
+) -> SimpleNamespace:
     """Kernels `g2p_adjoint`, `grid_adjoint`, `p2g_adjoint` and `total_adjoint`, see `kernels.forward_kernels`."""
+    contact = "contact" in features
     t, functions = warp_types(dtype), grid_functions(dtype)
-    Obstacle, touching = obstacle_type(dtype), contact_functions(dtype)
+    Obstacle, touching = obstacle_type(dtype), contact_functions(dtype, "meshes" in features)
     touch, touch_adjoint = touching.contact, touching.contact_adjoint
     ordered = scatter != "atomic"
     run_of, deposit = scatter_functions(dtype, scatter, 3)
@@ -30,7 +33,7 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic", contact: bool =
     stencil, slopes, moments = functions.stencil, functions.slopes, functions.moments
     column, wall_mask, moved_mask = functions.column, functions.wall_mask, functions.moved_mask
     gather, three_nodes = gather_functions(dtype)
-    module = f"neuma_lib.sim.adjoint_{str(dtype).removeprefix('torch.')}_{scatter}{'_contact' * contact}"
+    module = f"neuma_lib.sim.adjoint_{str(dtype).removeprefix('torch.')}_{'_'.join((scatter, *features))}"
     kernel = functools.partial(wp.kernel, enable_backward=False, module=module)
 
     @kernel
@@ -126,6 +129,7 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic", contact: bool =
         vol0: wp.array(dtype=real),
         radius: wp.array(dtype=real),
         obstacles: wp.array2d(dtype=Obstacle),
+        distances: wp.array(dtype=real),
         stuck: wp.array2d(dtype=vec3),
         grad_grid_rows: wp.array2d(dtype=mat34),
         grad_x: wp.array(dtype=vec3),
@@ -146,7 +150,7 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic", contact: bool =
         v_p = v[now, p]
         if wp.static(contact):
             v_p, _stuck, touches = touch(
-                obstacles, pose, c.faces, c.dt, x[now, p], v_p, stuck[now, p], radius[p]
+                obstacles, distances, pose, c.faces, c.dt, x[now, p], v_p, stuck[now, p], radius[p]
             )
         q0 = m * v_p - A * f
         q_i = vec4(q0[0], q0[1], q0[2], m)
@@ -171,6 +175,7 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic", contact: bool =
             if touches > 0:
                 g_x, g_v_before, g_s = touch_adjoint(
                     obstacles,
+                    distances,
                     pose,
                     c.faces,
                     c.dt,

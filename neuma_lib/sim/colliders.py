@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -13,11 +15,73 @@ from neuma_lib.errors import InputError
 from neuma_lib.sim.motion import Motion, Vector, vector
 
 SIZES = {"plane": (), "box": ("half width", "half height", "half depth"), "sphere": ("radius",)}
-SIZES["capsule"] = ("half length", "radius")
+SIZES |= {"capsule": ("half length", "radius"), "mesh": ()}
 """Lengths [m] that describe each shape. A plane fills y <= 0, a capsule extends along y, in the frame of the shape."""
 
 CONTACT_STIFFNESS = 0.5
 """Part of a penetration that contact removes in a time step. Any value from 0.1 to 1 is stable on every grid."""
+
+
+@dataclass(frozen=True, eq=False)
+class DistanceGrid:
+    """Signed distance to a closed surface at the nodes of a grid, negative inside. Equal if the numbers are.
+
+    Within a cell it is interpolated trilinearly. Outside the grid, whose outer nodes must be outside the surface, a
+    point at the distance a from the grid has the distance sqrt(a^2 + d^2), with the interpolated d of the nearest point
+    of the grid. That is a lower bound, exact next to a vertex of the surface.
+
+    Attributes:
+        values: distances [m], shape (I, J, K), at least two nodes along an axis.
+        lowest: position of the first node [m].
+        spacing: of the nodes [m].
+    """
+
+    values: np.ndarray
+    lowest: Vector
+    spacing: float
+    digest: bytes = field(init=False, repr=False)
+
+    def __post_init__(self):
+        values = np.array(self.values, np.float32)
+        values.setflags(write=False)
+        if values.ndim != 3 or min(values.shape) < 2 or not np.isfinite(values).all():
+            raise InputError("distances.values", f"shape {values.shape} must be (I, J, K) with finite values")
+        if min(values.take((0, -1), axis).min() for axis in range(3)) <= 0:
+            raise InputError("distances.values", "the surface leaves the grid", "Use a larger grid")
+        object.__setattr__(self, "values", values)
+        object.__setattr__(self, "lowest", vector(self.lowest, "distances.lowest"))
+        numbers = np.array([*values.shape, *self.lowest, self.spacing]).tobytes()
+        object.__setattr__(self, "digest", hashlib.sha256(numbers + values.tobytes()).digest())
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, DistanceGrid) and self.digest == other.digest
+
+    def __hash__(self) -> int:
+        return hash(self.digest)
+
+    def at(self, y: Tensor) -> tuple[Tensor, Tensor]:
+        """Distance (...,) [m] of points y (..., 3), and the direction (..., 3) of its gradient."""
+        values, nodes = torch.from_numpy(self.values.copy()).to(y), y.new_tensor(self.values.shape)
+        scaled = (y - y.new_tensor(self.lowest)) / self.spacing
+        within = scaled.clamp(torch.zeros_like(nodes), nodes - 1)
+        base = torch.minimum(within.detach().floor(), nodes - 2)
+        f, base = within - base, base.long()
+        distance, slope = 0.0, [0.0, 0.0, 0.0]
+        for corner in torch.cartesian_prod(*[torch.arange(2)] * 3).tolist():
+            value = values[tuple((base[..., a] + corner[a]) for a in range(3))]
+            weights = [f[..., a] if corner[a] else 1 - f[..., a] for a in range(3)]
+            distance = distance + weights[0] * weights[1] * weights[2] * value
+            for a in range(3):
+                rest = weights[a - 1] * weights[a - 2] * value
+                slope[a] = slope[a] + (rest if corner[a] else -rest)
+        gradient = torch.stack(slope, dim=-1) / self.spacing
+        beyond = (scaled - within) * self.spacing
+        outside = (beyond != 0).any(dim=-1)
+        length = torch.where(outside, (beyond**2).sum(dim=-1) + distance**2, 1.0).sqrt()
+        gradient = torch.where(
+            outside[..., None], torch.where(beyond != 0, beyond, distance[..., None] * gradient), gradient
+        )
+        return torch.where(outside, length, distance), gradient / gradient.norm(dim=-1, keepdim=True)
 
 
 @dataclass(frozen=True)
@@ -44,6 +108,7 @@ class Collider(Motion):
         friction: Coulomb coefficient. Infinity sticks.
         damping: part of the approaching velocity that an impulse removes, 0 (elastic) to 1.
         velocity, spin, keyframes: prescribed motion, see `Motion`.
+        distances: of a mesh (`geometry.mesh_collider`), in its frame.
 
     Raises:
         InputError: a value is out of range or unknown.
@@ -58,10 +123,13 @@ class Collider(Motion):
     velocity: Vector = (0.0, 0.0, 0.0)
     spin: Vector = (0.0, 0.0, 0.0)
     keyframes: tuple[tuple[float, Vector, Vector], ...] = ()
+    distances: DistanceGrid | None = None
 
     def __post_init__(self):
         if self.shape not in SIZES:
             raise InputError("collider.shape", f"{self.shape!r} must be one of {', '.join(SIZES)}")
+        if (self.distances is not None) != (self.shape == "mesh"):
+            raise InputError("collider.distances", "must be given for the shape mesh and no other")
         lengths = SIZES[self.shape]
         expected = f"must be positive: {', '.join(lengths) or 'none'} [m]"
         size = vector(self.size, "collider.size", len(lengths), expected)
@@ -102,6 +170,8 @@ class Collider(Motion):
             length = beyond.norm(dim=-1, keepdim=True)
             distance = torch.where((q > 0).any(dim=-1), length[..., 0], q.amax(dim=-1))
             normal = torch.where(y < 0, -1.0, 1.0) * beyond / length
+        elif self.distances is not None:
+            distance, normal = self.distances.at(y)
         else:
             half = self.size[0] if self.shape == "capsule" else 0.0
             up = x.new_tensor([0.0, 1.0, 0.0])

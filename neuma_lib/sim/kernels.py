@@ -173,18 +173,21 @@ def grid_functions(dtype: torch.dtype) -> SimpleNamespace:
 
 
 @functools.cache
-def forward_kernels(dtype: torch.dtype, scatter: str = "atomic", contact: bool = False) -> SimpleNamespace:
+def forward_kernels(
+    dtype: torch.dtype, scatter: str = "atomic", features: tuple[str, ...] = ()
+) -> SimpleNamespace:
     """Kernels `cells`, `p2g`, `grid_update`, `g2p`, `trial_deformation` and `advect_tracers` for a precision, a
-    scatter method, and with or without contact of particles."""
+    scatter method and features of the model: "contact" of particles, and "meshes" that they touch."""
+    contact = "contact" in features
     t, functions = warp_types(dtype), grid_functions(dtype)
-    Obstacle, touch = obstacle_type(dtype), contact_functions(dtype).contact
+    Obstacle, touch = obstacle_type(dtype), contact_functions(dtype, "meshes" in features).contact
     ordered = scatter != "atomic"
     run_of, deposit = scatter_functions(dtype, scatter, 4)
     real, vec3, vec4, mat33, mat34, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.mat34, t.GridConstants
     copy_of, stencil, moments = functions.copy_of, functions.stencil, functions.moments
     column, wall_mask, moved = functions.column, functions.wall_mask, functions.moved
     gather, _ = gather_functions(dtype)
-    module = f"neuma_lib.sim.forward_{str(dtype).removeprefix('torch.')}_{scatter}{'_contact' * contact}"
+    module = f"neuma_lib.sim.forward_{str(dtype).removeprefix('torch.')}_{'_'.join((scatter, *features))}"
     kernel = functools.partial(wp.kernel, enable_backward=False, module=module)
 
     @kernel
@@ -211,6 +214,7 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic", contact: bool =
         vol0: wp.array(dtype=real),
         radius: wp.array(dtype=real),
         obstacles: wp.array2d(dtype=Obstacle),
+        distances: wp.array(dtype=real),
         stuck: wp.array2d(dtype=vec3),
         grid_rows: wp.array2d(dtype=mat34),
     ):
@@ -229,7 +233,7 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic", contact: bool =
         v_p = v[now, p]
         if wp.static(contact):
             v_p, stuck_p, _touches = touch(
-                obstacles, pose, c.faces, c.dt, x[now, p], v_p, stuck[now, p], radius[p]
+                obstacles, distances, pose, c.faces, c.dt, x[now, p], v_p, stuck[now, p], radius[p]
             )
             stuck[after, p] = stuck_p
         # q = (m v + A d, m) grows by a column of A from node to node

@@ -19,7 +19,7 @@ from torch import Tensor
 from neuma_lib.sim import kernels
 from neuma_lib.sim.adjoint_kernels import adjoint_kernels
 from neuma_lib.sim.colliders import contact_radius
-from neuma_lib.sim.contact_kernels import obstacle_type, obstacles
+from neuma_lib.sim.contact_kernels import distances, obstacle_type, obstacles
 from neuma_lib.sim.graphs import MAX_GRAPHS, GraphCache
 from neuma_lib.sim.kernels import NO_FAULT, forward_kernels, warp_types
 from neuma_lib.sim.model import MPM, WALLS
@@ -72,6 +72,7 @@ class Workspace:
         mass, vol0: particle masses [kg] and initial volumes [m^3], shape (N,).
         radius: radii of the particles in contact [m], shape (N,).
         obstacles: colliders at the steps of a segment, or at one step if none moves, shape (poses, colliders).
+        distances: values of the grids of colliders that are meshes.
         faults: first step and particle with a non-finite value, with a move of more than a cell in a step, and
             outside the grid, shape (copies, 3).
         order: particles sorted by cell every `SORT_EVERY` steps, shape (n_sorts, N).
@@ -105,6 +106,11 @@ class Workspace:
         self.grid, self.grid_v = self._buffer((cached, nodes), "vec4"), self._buffer((cached, nodes), "vec4")
         self.mass, self.vol0, self.radius = (self._buffer((N,), "real") for _ in range(3))
         self.obstacles = self._obstacles([0.0] * size.n_poses)
+        self.distances = wp.array(
+            distances(size.model.obstacles),
+            dtype=warp_types(size.dtype).real,
+            device=wp.device_from_torch(size.device),
+        )
         self.faults = self._buffer((size.copies, 3), dtype=torch.int64)
         self.checkpoints = tuple(
             value.new_empty(size.n_checkpoints, *value.shape[1:]) for value in self.carried
@@ -218,7 +224,7 @@ class Workspace:
 
     def tracer_launch(self, tracers: Tensor) -> wp.Launch:
         """A recorded launch, for `move_tracers`, that advects `tracers` (M, 3) in place."""
-        kernel = forward_kernels(self.size.dtype, self.size.scatter, self._contact).advect_tracers
+        kernel = forward_kernels(self.size.dtype, self.size.scatter, self._features).advect_tracers
         positions = wp.from_torch(tracers, dtype=warp_types(self.size.dtype).vec3)
         return self._record(kernel, len(tracers), 0, self._rows(self.grid_v), positions)
 
@@ -282,6 +288,12 @@ class Workspace:
         return self.size.model.contact == "particles"
 
     @property
+    def _features(self) -> tuple[str, ...]:
+        """Features of the model for the kernels."""
+        meshes = any(collider.distances for collider in self.size.model.colliders)
+        return ("contact",) * self._contact + ("meshes",) * meshes
+
+    @property
     def _node_count(self) -> int:
         """Number of nodes of all copies."""
         return self.size.copies * self.size.model.nodes**3
@@ -293,14 +305,15 @@ class Workspace:
         return -(-N // BLOCK) * BLOCK if self.sorts else N
 
     def _record_forward(self) -> None:
-        k = forward_kernels(self.size.dtype, self.size.scatter, self._contact)
+        k = forward_kernels(self.size.dtype, self.size.scatter, self._features)
         N, nodes = self.size.particles, self._node_count
         rows, rows_v = self._rows(self.grid), self._rows(self.grid_v)
         if self.sorts:
             self._cells = self._record(k.cells, N, 0, self.x, self.cells)
         self._p2g = self._record(
             k.p2g, self._scattering_threads, 0, 0, 0, 0, 0, self.order,
-            self.x, self.v, self.C, self.tau, self.mass, self.vol0, self.radius, self.obstacles, self.stuck, rows,
+            self.x, self.v, self.C, self.tau, self.mass, self.vol0, self.radius,
+            self.obstacles, self.distances, self.stuck, rows,
         )  # fmt: skip
         self._grid_update = self._record(k.grid_update, nodes, 0, self.grid, self.grid_v)
         self._g2p = self._record(
@@ -313,7 +326,7 @@ class Workspace:
             self._total = self._record(k.trial_deformation, N, 0, 0, 0, self.C, F_total, F_total)
 
     def _record_adjoint(self) -> None:
-        k = adjoint_kernels(self.size.dtype, self.size.scatter, self._contact)
+        k = adjoint_kernels(self.size.dtype, self.size.scatter, self._features)
         N, nodes = self.size.particles, self._node_count
         rows_v, grad_rows = self._rows(self.grid_v), self._rows(self.grad_grid)
         self._g2p_adjoint = self._record(
@@ -324,7 +337,8 @@ class Workspace:
         self._grid_adjoint = self._record(k.grid_adjoint, nodes, 0, 0, self.grid, self.grad_grid)
         self._p2g_adjoint = self._record(
             k.p2g_adjoint, N, 0, 0, 0, 0,
-            self.x, self.v, self.C, self.tau, self.mass, self.vol0, self.radius, self.obstacles, self.stuck, grad_rows,
+            self.x, self.v, self.C, self.tau, self.mass, self.vol0, self.radius,
+            self.obstacles, self.distances, self.stuck, grad_rows,
             self.grad_x, self.grad_v, self.grad_C, self.grad_tau, self.grad_stuck,
         )  # fmt: skip
         if self.size.total:
