@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import trimesh
+from skimage.measure import marching_cubes
 
 from neuma_lib.sim.colliders import Collider
 
@@ -66,5 +67,9 @@ def _surface(collider: Collider) -> trimesh.Trimesh:
     if collider.shape == "capsule":
         mesh = trimesh.creation.capsule(height=2 * size[0], radius=size[1], count=[32, 32])
         return mesh.apply_transform(trimesh.geometry.align_vectors([0, 0, 1], [0, 1, 0]))
+    if collider.distances is not None:
+        grid = collider.distances
+        corners, faces, _, _ = marching_cubes(grid.values.copy(), 0.0, gradient_direction="ascent")
+        return trimesh.Trimesh(grid.lowest + grid.spacing * corners, faces, process=False)
     corners = PLANE_REACH * np.array([[-1, 0, -1], [-1, 0, 1], [1, 0, 1], [1, 0, -1]])
     return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)

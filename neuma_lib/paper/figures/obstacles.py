@@ -25,10 +25,11 @@ from neuma_lib.paper.image_grid import ImageGrid, rows_figure
 from neuma_lib.splatting.viewpoints import framing
 
 LEFT, TOP = 0.75, 0.05
-DIRECTION = np.array([0.35, 0.3, 1.0])
-"""From the scene to the camera."""
-FLOOR = (0.93, 0.93, 0.91)
-GLASS = 0.25
+DIRECTION = np.array([0.35, 0.36, 1.0])
+"""From the scene to the camera: so far above the floor that no horizon is in the frame."""
+FLOOR, FLOOR_REACH = (0.93, 0.93, 0.91), 5.0
+"""Colour of the floor, and half of its side [m], so that it fills the frame."""
+GLASS = 0.15
 """Opacity of an obstacle around a body."""
 
 
@@ -68,7 +69,7 @@ def _shown(obstacle: Obstacle, middle: np.ndarray) -> Obstacle:
 
 def _pictures(body, around: list[Obstacle], params) -> np.ndarray:
     """Pictures (T, H, W, 3) of a body, obstacles and the floor."""
-    square = np.array([[0.0, 0, 0], [0, 0, 1], [1, 0, 1], [1, 0, 0]])
+    square = FLOOR_REACH * np.array([[-1.0, 0, -1], [-1, 0, 1], [1, 0, 1], [1, 0, -1]])
     frames = len(around[0].poses)
     floor = Obstacle(square, np.array([[0, 1, 2], [0, 2, 3]]), np.tile(np.eye(4), (frames, 1, 1)), FLOOR)
     seen = np.concatenate([body.points, *(each.placed(k) for each in around for k in range(frames))])
