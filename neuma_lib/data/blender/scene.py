@@ -150,10 +150,7 @@ def render_images(
             threads=threads,
             device=device,
             matte=matte,
-            obstacle_poses=np.array([each.poses for each in obstacles]),
-            obstacle_colors=np.array([(*linear(each.color), each.opacity) for each in obstacles]),
-            **{f"obstacle_{k}_vertices": each.vertices for k, each in enumerate(obstacles)},
-            **{f"obstacle_{k}_faces": each.faces for k, each in enumerate(obstacles)},
+            **obstacle_arrays(obstacles),
         )
         job.write_bytes(content.getbuffer())
         run_worker(worker.__name__, job, len(shots), progress)
@@ -163,6 +160,17 @@ def render_images(
                 _add_surroundings(image, image.with_stem(f"{image.stem}_all"))
             image.write_bytes(_pixels_only(image.read_bytes()))
             os.replace(image, out_dir / name)
+
+
+def obstacle_arrays(obstacles: Sequence[Obstacle]) -> dict[str, np.ndarray]:
+    """Arrays of obstacles for the Blender process."""
+    arrays = {
+        "obstacle_poses": np.array([each.poses for each in obstacles]),
+        "obstacle_colors": np.array([(*linear(each.color), each.opacity) for each in obstacles]),
+    }
+    for k, each in enumerate(obstacles):
+        arrays |= {f"obstacle_{k}_vertices": each.vertices, f"obstacle_{k}_faces": each.faces}
+    return arrays
 
 
 def _add_surroundings(image: Path, whole: Path) -> None:
