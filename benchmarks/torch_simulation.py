@@ -2,20 +2,27 @@
 
 import torch
 
+from neuma_lib.sim.clamps import HELD_SHARE, clamped_particles
 from neuma_lib.sim.colliders import CONTACT_STIFFNESS, contact_radius
 from neuma_lib.sim.model import as_regions
 
 
-def step(model, bodies, x, v, F, C, stuck, mass, vol0, time=0.0):
+def step(model, bodies, x, v, F, C, stuck, mass, vol0, time=0.0, clamp=None):
     """One step of the paper's Algorithm 2 with all 27 nodes of a particle as one axis.
 
     Args:
         stuck: tangential displacements of particles in contact [m], shape (N, 3).
-        time: of the step [s], for moving colliders.
+        time: of the step [s], for moving colliders and clamps.
+        clamp: index of the clamp of each particle, or -1, shape (N,).
     """
     n, dx, dt = model.nodes, model.dx, model.dt
     tau = evaluate(bodies, "elasticity", F)
-    v, stuck = contact(model, x, v, stuck, vol0, time)
+    clamp = torch.full_like(mass, -1) if clamp is None else clamp
+    held = [(each, clamp == k) for k, each in enumerate(model.clamps) if each.holds(time, dt)]
+    free = ~sum((mine for _, mine in held), start=torch.zeros_like(mass, dtype=torch.bool))
+    free_v, free_stuck = contact(model, x[free], v[free], stuck[free], vol0[free], time)
+    v, stuck = v.index_put((free,), free_v), torch.zeros_like(stuck).index_put((free,), free_stuck)
+    all_mass, mass, vol0 = mass, free * mass, free * vol0
     cells = x / dx - model.first_node
     base = (cells.detach() - 0.5).int()
     f = cells - base
@@ -36,11 +43,22 @@ def step(model, bodies, x, v, F, C, stuck, mass, vol0, time=0.0):
     gravity = x.new_tensor(model.gravity)
     grid_v = torch.where(m[:, None] > 0, mv / m.clamp(min=1e-300)[:, None] + dt * gravity, 0.0)
     grid_v = walls(model, grid_v.reshape(n, n, n, 3)).reshape(-1, 3)
+    nodes = torch.cartesian_prod(*[torch.arange(n)] * 3).to(x) * dx + model.first_node * dx
+    held_mass = [
+        m.new_zeros(n**3).index_add(0, flat[mine].flatten(), (weight * all_mass[:, None])[mine].flatten())
+        for _, mine in held
+    ]
+    for (each, _), own in zip(held, held_mass, strict=True):
+        holds = (own > 0) & (sum(held_mass) > HELD_SHARE * (sum(held_mass) + m))
+        grid_v = torch.where(holds[:, None], rigid_velocity(each, nodes, time, dt)[0], grid_v)
 
     v = torch.einsum("pi,pia->pa", weight, grid_v[flat])
     C = (4 / dx**2) * torch.einsum("pi,pia,pib->pab", weight, grid_v[flat], d)
+    for each, mine in held:
+        own_v, own_C = rigid_velocity(each, x, time, dt)
+        v, C = torch.where(mine[:, None], own_v, v), torch.where(mine[:, None, None], own_C, C)
     x = x + dt * v
-    if model.clamps:
+    if model.bounds_positions:
         x = x.clamp(*model.stencil_range)
     F = evaluate(bodies, "plasticity", F + dt * C @ F)
     return x, v, F, C, stuck
@@ -74,6 +92,15 @@ def touched(collider, x, v, stuck, radius, dt, time):
     moved = torch.where(slides, limited * dt / CONTACT_STIFFNESS, sticking + dt * slip)
     after = v + impulse[:, None] * n - limited
     return torch.where(touches, after, v), torch.where(touches, moved, stuck), touches[:, 0]
+
+
+def rigid_velocity(motion, x, time, dt):
+    """Velocities (..., 3) with which points x (..., 3) of a moving frame reach their next place, and the gradient."""
+    (axes, centre), (next_axes, next_centre) = (
+        tuple(p.to(x) for p in motion.pose(t)) for t in (time, time + dt)
+    )
+    turn = next_axes @ axes.mT
+    return (next_centre + (x - centre) @ turn.mT - x) / dt, (turn - torch.eye(3).to(x)) / dt
 
 
 def walls(model, grid_v):
@@ -111,10 +138,11 @@ def rollout(model, law, state, frames, total=False):
     bodies = as_regions(law, len(state.x))
     now, stuck, seen = state.motion, torch.zeros_like(state.x), []
     F_total = (state.F,) if total else ()
+    clamp = clamped_particles(model.clamps, state.x) if state.clamp is None else state.clamp
     for n in range(frames[-1] + 1):
         if n in frames:
             seen.append((*now, *F_total))
         if n < frames[-1]:
-            *now, stuck = step(model, bodies, *now, stuck, state.mass, state.vol0, n * model.dt)
+            *now, stuck = step(model, bodies, *now, stuck, state.mass, state.vol0, n * model.dt, clamp)
             F_total = tuple(F + model.dt * now[3] @ F for F in F_total)
     return tuple(torch.stack(values) for values in zip(*seen, strict=True))

@@ -12,9 +12,10 @@ from types import SimpleNamespace
 import torch
 import warp as wp
 
+from neuma_lib.sim.clamp_kernels import clamp_functions, hold_type
 from neuma_lib.sim.contact_kernels import contact_functions, obstacle_type
 from neuma_lib.sim.gather import gather_functions
-from neuma_lib.sim.kernels import grid_functions, warp_types
+from neuma_lib.sim.kernels import NO_CONTACT, grid_functions, warp_types
 from neuma_lib.sim.scatter import scatter_functions
 
 
@@ -23,7 +24,8 @@ def adjoint_kernels(
     dtype: torch.dtype, scatter: str = "atomic", features: tuple[str, ...] = ()
 ) -> SimpleNamespace:
     """Kernels `g2p_adjoint`, `grid_adjoint`, `p2g_adjoint` and `total_adjoint`, see `kernels.forward_kernels`."""
-    contact = "contact" in features
+    contact, clamps = "contact" in features, "clamps" in features
+    Hold, held, _ = hold_type(dtype), *vars(clamp_functions(dtype)).values()
     t, functions = warp_types(dtype), grid_functions(dtype)
     Obstacle, touching = obstacle_type(dtype), contact_functions(dtype, "meshes" in features)
     touch, touch_adjoint = touching.contact, touching.contact_adjoint
@@ -44,6 +46,7 @@ def adjoint_kernels(
         cached: wp.int32,
         side: wp.int32,
         sort: wp.int32,
+        pose: wp.int32,
         order: wp.array2d(dtype=wp.int32),
         x: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
@@ -55,6 +58,8 @@ def adjoint_kernels(
         grad_F_trial: wp.array(dtype=mat33),
         grad_x: wp.array(dtype=vec3),
         grad_F: wp.array(dtype=mat33),
+        holds: wp.array2d(dtype=Hold),
+        clamp: wp.array(dtype=wp.int32),
         grad_grid_rows: wp.array2d(dtype=mat34),
     ):
         """From gradients of x, v, C after the step and of F_trial to those of grid_v (added), x and F (set)."""
@@ -72,6 +77,11 @@ def adjoint_kernels(
         g_C = grad_C[p] + c.dt * (g_trial * wp.transpose(F[now, p]))
         g_x = wp.cw_mul(moved_mask(c, x[after, p]), grad_x[p])
         g_v = grad_v[p] + c.dt * g_x
+        if wp.static(clamps):
+            if held(holds, pose, clamp[p]):  # v = A (x - centre) + velocity, and no node moves with v or C
+                g_x = g_x + wp.transpose(holds[pose, clamp[p]].A) * g_v
+                g_v = vec3()
+                g_C = mat33()
         # Node i receives w_i u_i with u_i = g_v + D d_i / dx. u grows by a column of D from node to node.
         D = (real(4.0) * c.inv_dx) * g_C
         u0 = g_v - D * f
@@ -112,6 +122,9 @@ def adjoint_kernels(
             g = grad_grid[side, node]
             g_mv = wp.cw_mul(vec3(g[0], g[1], g[2]), wall_mask(c, node, v + c.dt * c.gravity)) / mv[3]
             grad_grid[side, node] = vec4(g_mv[0], g_mv[1], g_mv[2], -wp.dot(g_mv, v))
+        if wp.static(clamps):
+            if mv[3] < real(0.0):  # a held node
+                grad_grid[side, node] = vec4()
         grad_grid[1 - side, node] = vec4()
 
     @kernel
@@ -131,6 +144,8 @@ def adjoint_kernels(
         obstacles: wp.array2d(dtype=Obstacle),
         distances: wp.array(dtype=real),
         stuck: wp.array2d(dtype=vec3),
+        holds: wp.array2d(dtype=Hold),
+        clamp: wp.array(dtype=wp.int32),
         grad_grid_rows: wp.array2d(dtype=mat34),
         grad_x: wp.array(dtype=vec3),
         grad_v: wp.array(dtype=vec3),
@@ -145,12 +160,19 @@ def adjoint_kernels(
         wd_i, wd_j, wd_k = moments(wi, f[0]), moments(wj, f[1]), moments(wk, f[2])
         # q_i = (m v + A d_i, m) as in p2g
         m = mass[p]
-        stress = real(4.0) * c.dt * c.inv_dx * c.inv_dx * vol0[p]
+        vol = vol0[p]
+        r = radius[p]
+        if wp.static(clamps):
+            if held(holds, pose, clamp[p]):
+                m = real(0.0)
+                vol = real(0.0)
+                r = real(wp.static(NO_CONTACT))
+        stress = real(4.0) * c.dt * c.inv_dx * c.inv_dx * vol
         A = c.dx * (m * C[now, p] - stress * tau[cached, p])
         v_p = v[now, p]
         if wp.static(contact):
             v_p, _stuck, touches = touch(
-                obstacles, distances, pose, c.faces, c.dt, x[now, p], v_p, stuck[now, p], radius[p]
+                obstacles, distances, pose, c.faces, c.dt, x[now, p], v_p, stuck[now, p], r
             )
         q0 = m * v_p - A * f
         q_i = vec4(q0[0], q0[1], q0[2], m)
@@ -182,7 +204,7 @@ def adjoint_kernels(
                     x[now, p],
                     v[now, p],
                     stuck[now, p],
-                    radius[p],
+                    r,
                     g_v,
                     grad_stuck[p],
                 )

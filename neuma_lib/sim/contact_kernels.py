@@ -83,8 +83,8 @@ def contact_functions(dtype: torch.dtype, meshes: bool = False) -> SimpleNamespa
 
     ``contact(obstacles, distances, pose, faces, dt, x, v, s, r)`` gives the velocity v and the tangential displacement
     s of a particle at x of radius r after contact with the obstacles of row ``pose``, and whether it touches one. The
-    first ``faces`` obstacles, 6 or none, are those of the unit cube. ``contact_adjoint(..., g_v, g_s)`` takes gradients of
-    the results of a particle that touches to those of x, v and s.
+    first ``faces`` obstacles, 6 or none, are those of the unit cube. ``contact_adjoint(..., g_v, g_s)`` takes gradients
+    of the results of a particle that touches to those of x, v and s.
     """
     real = {torch.float32: wp.float32, torch.float64: wp.float64}[dtype]
     vec3, vec11 = (wp.types.vector(length=n, dtype=real) for n in (3, 11))

@@ -22,6 +22,8 @@ def free_flight_steps(
     Copies (see `kernels`) may have different velocities. The first contact of any copy ends free flight for all.
     """
     x, v, F, C = state.x, state.v, state.F, state.C
+    if model.clamps:
+        return 0
     if torch.is_grad_enabled() and (v.ndim == 2 and v.requires_grad or F.requires_grad or C.requires_grad):
         return 0
     with torch.no_grad():

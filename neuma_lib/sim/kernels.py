@@ -25,6 +25,8 @@ import torch
 import warp as wp
 
 from neuma_lib.device import start_warp
+from neuma_lib.sim.clamp_kernels import clamp_functions, hold_type
+from neuma_lib.sim.clamps import HELD_SHARE
 from neuma_lib.sim.contact_kernels import contact_functions, obstacle_type
 from neuma_lib.sim.gather import gather_functions
 from neuma_lib.sim.scatter import scatter_functions
@@ -36,6 +38,9 @@ NO_SLIP, SLIP, STICKY = 0, 1, 2
 
 NO_FAULT = 2**62
 """Value of a fault flag without a fault."""
+
+NO_CONTACT = -1e3
+"""Radius [m] of clamped particles, which touch no collider."""
 
 
 @functools.cache
@@ -177,8 +182,9 @@ def forward_kernels(
     dtype: torch.dtype, scatter: str = "atomic", features: tuple[str, ...] = ()
 ) -> SimpleNamespace:
     """Kernels `cells`, `p2g`, `grid_update`, `g2p`, `trial_deformation` and `advect_tracers` for a precision, a
-    scatter method and features of the model: "contact" of particles, and "meshes" that they touch."""
-    contact = "contact" in features
+    scatter method and features of the model: "contact" of particles, "meshes" that they touch, and "clamps"."""
+    contact, clamps = "contact" in features, "clamps" in features
+    Hold, held, prescribed = hold_type(dtype), *vars(clamp_functions(dtype)).values()
     t, functions = warp_types(dtype), grid_functions(dtype)
     Obstacle, touch = obstacle_type(dtype), contact_functions(dtype, "meshes" in features).contact
     ordered = scatter != "atomic"
@@ -216,11 +222,15 @@ def forward_kernels(
         obstacles: wp.array2d(dtype=Obstacle),
         distances: wp.array(dtype=real),
         stuck: wp.array2d(dtype=vec3),
+        holds: wp.array2d(dtype=Hold),
+        clamp: wp.array(dtype=wp.int32),
+        held_mass: wp.array(dtype=real),
+        held_by: wp.array(dtype=wp.int32),
         grid_rows: wp.array2d(dtype=mat34),
     ):
         """m_i += w_i m, (m v)_i += w_i (m v + A d_i) with A = m C - dt vol0 (4/dx^2) tau, d_i = x_i - x.
 
-        v is the velocity after contact of particles.
+        v is the velocity after contact of particles. The mass of clamped particles goes to held_mass instead.
         """
         p = wp.tid()
         alive = p < mass.shape[0]
@@ -229,11 +239,24 @@ def forward_kernels(
         first, f, wi, wj, wk = stencil(c, p, x[now, p])
         run = run_of(wp.where(alive, first, -1))
         m = mass[p]
-        A = c.dx * (m * C[now, p] - (real(4.0) * c.dt * c.inv_dx * c.inv_dx * vol0[p]) * tau[cached, p])
+        vol = vol0[p]
+        r = radius[p]
+        if wp.static(clamps):
+            if held(holds, pose, clamp[p]):
+                for node in range(27):
+                    i, j, k = node / 9, node / 3 % 3, node % 3
+                    here = first + (i * c.n + j) * c.n + k
+                    if alive:
+                        wp.atomic_add(held_mass, here, wi[i] * wj[j] * wk[k] * m)
+                        wp.atomic_max(held_by, here, clamp[p])
+                m = real(0.0)
+                vol = real(0.0)
+                r = real(wp.static(NO_CONTACT))
+        A = c.dx * (m * C[now, p] - (real(4.0) * c.dt * c.inv_dx * c.inv_dx * vol) * tau[cached, p])
         v_p = v[now, p]
         if wp.static(contact):
             v_p, stuck_p, _touches = touch(
-                obstacles, distances, pose, c.faces, c.dt, x[now, p], v_p, stuck[now, p], radius[p]
+                obstacles, distances, pose, c.faces, c.dt, x[now, p], v_p, stuck[now, p], r
             )
             stuck[after, p] = stuck_p
         # q = (m v + A d, m) grows by a column of A from node to node
@@ -250,9 +273,19 @@ def forward_kernels(
 
     @kernel
     def grid_update(
-        c: GridConstants, cached: wp.int32, grid: wp.array2d(dtype=vec4), grid_v: wp.array2d(dtype=vec4)
+        c: GridConstants,
+        cached: wp.int32,
+        pose: wp.int32,
+        grid: wp.array2d(dtype=vec4),
+        grid_v: wp.array2d(dtype=vec4),
+        holds: wp.array2d(dtype=Hold),
+        held_mass: wp.array(dtype=real),
+        held_by: wp.array(dtype=wp.int32),
     ):
-        """v_i = (m v)_i / m_i + dt g where there is mass, then the boundary conditions."""
+        """v_i = (m v)_i / m_i + dt g where there is mass, then the boundary conditions.
+
+        Held nodes move with their clamp. Their mass becomes -1, so that `grid_adjoint` knows them.
+        """
         node = wp.tid()
         mv = grid[cached, node]
         result = vec4()
@@ -260,6 +293,13 @@ def forward_kernels(
             v = vec3(mv[0], mv[1], mv[2]) / mv[3] + c.dt * c.gravity
             v = wp.cw_mul(v, wall_mask(c, node, v))
             result = vec4(v[0], v[1], v[2], real(1.0))
+        if wp.static(clamps):
+            m = held_mass[node]
+            if m > real(wp.static(HELD_SHARE)) * (m + mv[3]):
+                place = vec3(real(node / (c.n * c.n) % c.n), real(node / c.n % c.n), real(node % c.n))
+                u = prescribed(holds[pose, held_by[node]], c.dx * (place + vec3(c.first)))
+                result = vec4(u[0], u[1], u[2], real(1.0))
+                grid[cached, node] = vec4(real(0.0), real(0.0), real(0.0), real(-1.0))
         grid_v[cached, node] = result
 
     @kernel
@@ -269,15 +309,21 @@ def forward_kernels(
         after: wp.int32,
         cached: wp.int32,
         step: wp.int32,
+        pose: wp.int32,
         grid_v_rows: wp.array2d(dtype=mat34),
         x: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
         C: wp.array2d(dtype=mat33),
         F: wp.array2d(dtype=mat33),
         F_trial: wp.array2d(dtype=mat33),
+        holds: wp.array2d(dtype=Hold),
+        clamp: wp.array(dtype=wp.int32),
         faults: wp.array2d(dtype=wp.int64),
     ):
-        """v = sum w_i v_i,  C = (4/dx^2) sum w_i v_i d_i^T,  x += dt v (clamped),  F_trial = (I + dt C) F."""
+        """v = sum w_i v_i,  C = (4/dx^2) sum w_i v_i d_i^T,  x += dt v (bounded),  F_trial = (I + dt C) F.
+
+        v and C of clamped particles are those of their clamp.
+        """
         p = wp.tid()
         xp = x[now, p]
         first, f, wi, wj, wk = stencil(c, p, xp)
@@ -288,6 +334,10 @@ def forward_kernels(
         C_new = (real(4.0) * c.inv_dx) * mat33(
             S[1, 0], S[2, 0], S[3, 0], S[1, 1], S[2, 1], S[3, 1], S[1, 2], S[2, 2], S[3, 2]
         )
+        if wp.static(clamps):
+            if held(holds, pose, clamp[p]):
+                v_new = prescribed(holds[pose, clamp[p]], xp)
+                C_new = holds[pose, clamp[p]].A
         x_new = moved(c, xp, v_new)
         x[after, p] = x_new
         v[after, p] = v_new

@@ -13,6 +13,7 @@ from torch import Tensor
 from neuma_lib.errors import InputError
 from neuma_lib.mechanics.catalogue import COURANT_LIMIT
 from neuma_lib.mechanics.law import Law, Weights
+from neuma_lib.sim.clamps import Clamp
 from neuma_lib.sim.colliders import Collider, contact_radius, unit_cube
 
 WALLS = ("x_min", "x_max", "y_min", "y_max", "z_min", "z_max")
@@ -52,6 +53,7 @@ class MPM:
         contact: one of `CONTACTS`.
         wall_cells: thickness of released walls [nodes].
         colliders: obstacles in the cube, for contact of particles only.
+        clamps: regions whose particles follow a prescribed motion.
 
     Raises:
         InputError: a value is out of range or unknown.
@@ -64,6 +66,7 @@ class MPM:
     contact: str = "nodes"
     wall_cells: int = 1
     colliders: tuple[Collider, ...] = ()
+    clamps: tuple[Clamp, ...] = ()
 
     def __post_init__(self):
         if not isinstance(self.grid, int) or self.grid < 6:
@@ -82,6 +85,7 @@ class MPM:
         object.__setattr__(self, "gravity", gravity)
         object.__setattr__(self, "boundary", _six_conditions(self.boundary))
         object.__setattr__(self, "colliders", tuple(self.colliders))
+        object.__setattr__(self, "clamps", tuple(self.clamps))
         if self.contact != "particles" and self.colliders:
             raise InputError("colliders", f"need contact of particles, not of {self.contact}")
         if self.contact == "particles" and "sticky" in self.boundary:
@@ -100,7 +104,13 @@ class MPM:
         return 1.0 / self.grid
 
     @property
-    def clamps(self) -> bool:
+    def changes(self) -> bool:
+        """Whether colliders or clamps depend on time."""
+        released = any(math.isfinite(clamp.release) for clamp in self.clamps)
+        return released or any(each.moves for each in (*self.colliders, *self.clamps))
+
+    @property
+    def bounds_positions(self) -> bool:
         """Whether positions are clamped to where their stencil exists."""
         return self.contact == "released"
 

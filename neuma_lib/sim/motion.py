@@ -93,6 +93,16 @@ class Motion:
         velocity, spin = (rate.to(x) for rate in self.rates(time))
         return velocity + torch.linalg.cross(spin.expand_as(x), x - centre.to(x))
 
+    def in_step(self, time: float, dt: float) -> tuple[Tensor, Tensor, Tensor]:
+        """Rigid motion from a time to ``time + dt`` [s] as a field of velocities A (x - centre) + velocity.
+
+        Returns:
+            A (3, 3) [1/s], centre (3,) [m] and velocity (3,) [m/s], float64.
+        """
+        (axes, centre), (next_axes, next_centre) = self.pose(time), self.pose(time + dt)
+        A = (next_axes @ axes.mT - torch.eye(3, dtype=torch.float64)) / dt
+        return A, centre, (next_centre - centre) / dt
+
     def at_rest(self) -> Self:
         """The same object, fixed in its pose at t = 0."""
         axes, centre = self.pose(0.0)

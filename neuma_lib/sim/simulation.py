@@ -18,6 +18,7 @@ from torch import Tensor
 
 from neuma_lib.errors import NonFiniteError
 from neuma_lib.mechanics.law import Constitutive, Weights
+from neuma_lib.sim.clamps import clamped_particles
 from neuma_lib.sim.kernels import NO_FAULT
 from neuma_lib.sim.memory import MemoryPlan
 from neuma_lib.sim.model import MPM, MaterialRegion, law_weights
@@ -78,7 +79,7 @@ class Simulation:
         x = state.x
         scatter = scatter or scatter_for(x.device, x.dtype)
         size = WorkspaceSize(model, len(x), x.dtype, x.device, total=total, copies=copies, scatter=scatter)
-        if any(collider.moves for collider in model.colliders):
+        if model.changes:
             size = size._replace(n_poses=steps + 1)
         if plan:
             size = size._replace(
@@ -89,6 +90,9 @@ class Simulation:
             )
         self.workspace = pooled_workspace(size, user=self)
         self.workspace.load_particles(state.mass.detach(), state.vol0.detach())
+        if model.clamps:
+            clamp = clamped_particles(model.clamps, state.x.detach()) if state.clamp is None else state.clamp
+            self.workspace.clamp.copy_(clamp)
         self._law_cache_bytes = plan.law_cache_bytes if plan else 0
         self._cached: set[tuple] = set()  # evaluations of laws with valid caches
         self._segment_in_memory = 0

@@ -23,6 +23,7 @@ class State:
         vol0: particle volumes in the undeformed body [m^3], shape (N,).
         F: elastic deformation gradients, shape (N, 3, 3), by default the identity.
         C: APIC affine velocities [1/s], shape (N, 3, 3), by default zero.
+        clamp: index of the clamp that holds each particle, or -1, shape (N,), by default from the positions.
 
     Raises:
         InputError: shapes, precisions or devices do not match, or a value is not finite or a mass or volume not
@@ -35,6 +36,7 @@ class State:
     vol0: Tensor
     F: Tensor = None  # type: ignore[assignment]
     C: Tensor = None  # type: ignore[assignment]
+    clamp: Tensor | None = None
 
     def __post_init__(self):
         x = self.x
@@ -63,6 +65,8 @@ class State:
                 raise InputError(f"state.{name}", "a value is not finite")
             if name in ("mass", "vol0") and not (value > 0).all():
                 raise InputError(f"state.{name}", f"{float(value.min()):g} must be positive")
+        if self.clamp is not None and self.clamp.shape != (N,):
+            raise InputError("state.clamp", f"shape {tuple(self.clamp.shape)} must be ({N},)")
 
     @classmethod
     def rigid(
@@ -99,11 +103,15 @@ class State:
         """Concatenate the particles of several bodies."""
         x, v, F, C = (torch.cat(parts) for parts in zip(*(body.motion for body in bodies), strict=True))
         mass, vol0 = (torch.cat([getattr(body, name) for body in bodies]) for name in ("mass", "vol0"))
-        return cls(x, v, mass, vol0, F, C)
+        clamps = [body.clamp for body in bodies if body.clamp is not None]
+        if clamps and len(clamps) < len(bodies):
+            raise InputError("state.clamp", "must be given for all joined bodies or for none")
+        return cls(x, v, mass, vol0, F, C, torch.cat(clamps) if clamps else None)
 
     def to(self, device: torch.device | str) -> State:
         """Copy to another device."""
-        return State(*(getattr(self, name).to(device) for name in ("x", "v", "mass", "vol0", "F", "C")))
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return State(**{name: None if value is None else value.to(device) for name, value in values.items()})
 
     @property
     def density(self) -> Tensor:

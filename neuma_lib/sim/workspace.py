@@ -18,6 +18,7 @@ from torch import Tensor
 
 from neuma_lib.sim import kernels
 from neuma_lib.sim.adjoint_kernels import adjoint_kernels
+from neuma_lib.sim.clamp_kernels import hold_type, holds
 from neuma_lib.sim.colliders import contact_radius
 from neuma_lib.sim.contact_kernels import distances, obstacle_type, obstacles
 from neuma_lib.sim.graphs import MAX_GRAPHS, GraphCache
@@ -50,7 +51,7 @@ class WorkspaceSize(NamedTuple):
     total: bool = False  # whether the state includes the total deformation
     copies: int = 1  # independent simulations with equal numbers of particles
     scatter: str = "atomic"  # scatter method
-    n_poses: int = 1  # steps of a segment if colliders move
+    n_poses: int = 1  # steps of a segment if colliders or clamps change
 
 
 class Workspace:
@@ -71,8 +72,11 @@ class Workspace:
         grid_v: velocity [m/s] of the nodes and 1 where there is mass, shape (n_cached_steps, copies * nodes^3, 4).
         mass, vol0: particle masses [kg] and initial volumes [m^3], shape (N,).
         radius: radii of the particles in contact [m], shape (N,).
-        obstacles: colliders at the steps of a segment, or at one step if none moves, shape (poses, colliders).
+        obstacles: colliders at the steps of a segment, or at one step if none changes, shape (poses, colliders).
         distances: values of the grids of colliders that are meshes.
+        holds: clamps at the steps of a segment, or at one step if none changes, shape (poses, clamps).
+        clamp: index of the clamp of each particle, or -1, shape (N,).
+        held_mass, held_by: mass of clamped particles at the nodes [kg], and the largest index of their clamps.
         faults: first step and particle with a non-finite value, with a move of more than a cell in a step, and
             outside the grid, shape (copies, 3).
         order: particles sorted by cell every `SORT_EVERY` steps, shape (n_sorts, N).
@@ -111,6 +115,10 @@ class Workspace:
             dtype=warp_types(size.dtype).real,
             device=wp.device_from_torch(size.device),
         )
+        self.holds = self._holds([0.0] * size.n_poses)
+        self.clamp = self._buffer((N if size.model.clamps else 1,), dtype=torch.int32)
+        held = nodes if size.model.clamps else 1
+        self.held_mass, self.held_by = self._buffer((held,), "real"), self._buffer((held,), dtype=torch.int32)
         self.faults = self._buffer((size.copies, 3), dtype=torch.int64)
         self.checkpoints = tuple(
             value.new_empty(size.n_checkpoints, *value.shape[1:]) for value in self.carried
@@ -166,14 +174,27 @@ class Workspace:
     def load_poses(self, first: int, steps: int) -> None:
         """Set the obstacles at the steps of a segment that starts at step ``first`` of the simulation."""
         if self.size.n_poses > 1:
-            source = self._obstacles([self.size.model.dt * (first + n) for n in range(steps)])
-            wp.copy(self.obstacles, source, count=source.size)
+            times = [self.size.model.dt * (first + n) for n in range(steps)]
+            for target, source in (
+                (self.obstacles, self._obstacles(times)),
+                (self.holds, self._holds(times)),
+            ):
+                wp.copy(target, source, count=source.size)
 
     def _obstacles(self, times: Sequence[float]) -> wp.array:
         """Colliders at some times [s]."""
         return wp.array(
             obstacles(self.size.model.obstacles, times, self.size.dtype),
             dtype=obstacle_type(self.size.dtype),
+            device=wp.device_from_torch(self.size.device),
+        )
+
+    def _holds(self, times: Sequence[float]) -> wp.array:
+        """Clamps in the steps from some times [s] on."""
+        model, dtype = self.size.model, self.size.dtype
+        return wp.array(
+            holds(model.clamps, times, model.dt, dtype),
+            dtype=hold_type(dtype),
             device=wp.device_from_torch(self.size.device),
         )
 
@@ -208,13 +229,16 @@ class Workspace:
         """From tau and the state of a step to the velocities of the nodes."""
         cached = self.cached_at(step)
         self.grid[cached].zero_()
+        if self.size.model.clamps:
+            self.held_mass.zero_()
+            self.held_by.zero_()
         _run(self._p2g, self.at(step), cached, self.sorted_at(step), self.pose_at(step), self.at(step + 1))
-        _run(self._grid_update, cached)
+        _run(self._grid_update, cached, self.pose_at(step))
 
     def transfer_to_particles(self, step: int) -> None:
         """From velocities of the nodes to x, v, C and the total deformation after the step, and to F_trial."""
         now, after = self.at(step), self.at(step + 1)
-        _run(self._g2p, now, after, self.cached_at(step), step)
+        _run(self._g2p, now, after, self.cached_at(step), step, self.pose_at(step))
         if self.size.total:
             _run(self._total, now, after, after)
 
@@ -242,7 +266,7 @@ class Workspace:
         side = step % 2
         if self.size.total:
             _run(self._total_adjoint, now, after)
-        _run(self._g2p_adjoint, now, after, cached, side, self.sorted_at(step))
+        _run(self._g2p_adjoint, now, after, cached, side, self.sorted_at(step), self.pose_at(step))
         _run(self._grid_adjoint, cached, side)
         _run(self._p2g_adjoint, now, cached, side, self.pose_at(step))
 
@@ -291,7 +315,9 @@ class Workspace:
     def _features(self) -> tuple[str, ...]:
         """Features of the model for the kernels."""
         meshes = any(collider.distances for collider in self.size.model.colliders)
-        return ("contact",) * self._contact + ("meshes",) * meshes
+        return (
+            ("contact",) * self._contact + ("meshes",) * meshes + ("clamps",) * bool(self.size.model.clamps)
+        )
 
     @property
     def _node_count(self) -> int:
@@ -308,17 +334,20 @@ class Workspace:
         k = forward_kernels(self.size.dtype, self.size.scatter, self._features)
         N, nodes = self.size.particles, self._node_count
         rows, rows_v = self._rows(self.grid), self._rows(self.grid_v)
+        held = self.holds, self.clamp
         if self.sorts:
             self._cells = self._record(k.cells, N, 0, self.x, self.cells)
         self._p2g = self._record(
             k.p2g, self._scattering_threads, 0, 0, 0, 0, 0, self.order,
             self.x, self.v, self.C, self.tau, self.mass, self.vol0, self.radius,
-            self.obstacles, self.distances, self.stuck, rows,
+            self.obstacles, self.distances, self.stuck, *held, self.held_mass, self.held_by, rows,
         )  # fmt: skip
-        self._grid_update = self._record(k.grid_update, nodes, 0, self.grid, self.grid_v)
+        self._grid_update = self._record(
+            k.grid_update, nodes, 0, 0, self.grid, self.grid_v, self.holds, self.held_mass, self.held_by
+        )
         self._g2p = self._record(
-            k.g2p, N, 0, 0, 0, 0,
-            rows_v, self.x, self.v, self.C, self.F, self.F_trial, self.faults,
+            k.g2p, N, 0, 0, 0, 0, 0,
+            rows_v, self.x, self.v, self.C, self.F, self.F_trial, *held, self.faults,
         )  # fmt: skip
         self._trial = self._record(k.trial_deformation, N, 0, 0, 0, self.C, self.F, self.F_trial)
         if self.size.total:
@@ -329,16 +358,17 @@ class Workspace:
         k = adjoint_kernels(self.size.dtype, self.size.scatter, self._features)
         N, nodes = self.size.particles, self._node_count
         rows_v, grad_rows = self._rows(self.grid_v), self._rows(self.grad_grid)
+        held = self.holds, self.clamp
         self._g2p_adjoint = self._record(
-            k.g2p_adjoint, self._scattering_threads, 0, 0, 0, 0, 0, self.order,
+            k.g2p_adjoint, self._scattering_threads, 0, 0, 0, 0, 0, 0, self.order,
             self.x, self.v, self.C, self.F, rows_v,
-            self.grad_v, self.grad_C, self.grad_F_trial, self.grad_x, self.grad_F, grad_rows,
+            self.grad_v, self.grad_C, self.grad_F_trial, self.grad_x, self.grad_F, *held, grad_rows,
         )  # fmt: skip
         self._grid_adjoint = self._record(k.grid_adjoint, nodes, 0, 0, self.grid, self.grad_grid)
         self._p2g_adjoint = self._record(
             k.p2g_adjoint, N, 0, 0, 0, 0,
             self.x, self.v, self.C, self.tau, self.mass, self.vol0, self.radius,
-            self.obstacles, self.distances, self.stuck, grad_rows,
+            self.obstacles, self.distances, self.stuck, *held, grad_rows,
             self.grad_x, self.grad_v, self.grad_C, self.grad_tau, self.grad_stuck,
         )  # fmt: skip
         if self.size.total:
@@ -393,6 +423,6 @@ def _grid_constants(size: WorkspaceSize):
     c.dx, c.inv_dx, c.dt = model.dx, float(model.grid), model.dt
     c.gravity = t.vec3(*model.gravity)
     low, high = model.stencil_range
-    c.clamp_low, c.clamp_high = (low, high) if model.clamps else (-math.inf, math.inf)
+    c.clamp_low, c.clamp_high = (low, high) if model.bounds_positions else (-math.inf, math.inf)
     c.leave_low, c.leave_high = low - LEAVING * model.dx, high + LEAVING * model.dx
     return c
