@@ -31,6 +31,7 @@ from neuma_lib.io.files import read_json
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.images import EXPOSURE_SAMPLES, load_videos
 from neuma_lib.io.particles import load_reconstruction
+from neuma_lib.io.simulator import simulator
 from neuma_lib.mechanics.adaptor import AdaptableLaw
 from neuma_lib.mechanics.analytic import specification
 from neuma_lib.mechanics.law import Law
@@ -134,7 +135,7 @@ class Scene:
             >>> path = simulate(scene.mpm, law, scene.state(), scene.video.frames)
         """
         settings, files = find_scene(folder)
-        mpm = MPM(**files.simulation)
+        mpm = simulator(files.simulation)
         body = load_reconstruction(files.particles, files.binding, files.gaussians, files.density)
         blur = {"dt": mpm.dt, "exposure_samples": settings.dataset.exposure_samples}
         return cls(

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from neuma_lib.config.scenes import is_mesh_file
+from neuma_lib.config.obstacles import is_mesh_file
 from neuma_lib.errors import InputError
 
 if TYPE_CHECKING:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pydantic import Field, model_validator
 
 from neuma_lib.config.base import Section, Vector
+from neuma_lib.config.obstacles import ColliderConfig
 
 
 class BodyConfig(Section):
@@ -47,3 +48,6 @@ class ExperimentConfig(Section):
     bodies: tuple[BodyConfig, ...] = Field(min_length=1, description="bodies on one grid")
     steps: int = Field(gt=0, description="simulated steps")
     dt: float | None = Field(None, gt=0, description="time step [s]; null: the smallest of the scenes")
+    colliders: tuple[ColliderConfig, ...] | None = Field(
+        None, description="obstacles, as of a scene; null: those of the scene of the first body"
+    )

@@ -11,6 +11,7 @@ from neuma_lib.config.base import Section, Vector, internal
 from neuma_lib.config.blender import AppearanceConfig
 from neuma_lib.config.dataset import CONVERGED, TruthConfig
 from neuma_lib.config.laws import LawConfig
+from neuma_lib.config.obstacles import ColliderConfig
 from neuma_lib.config.splats import SplatConfig
 
 
@@ -69,14 +70,6 @@ OF_A_SPLAT = {
 """Defaults of a scene with a splat: half a second of fall from half a metre."""
 
 
-MESH_SUFFIXES = (".obj", ".ply", ".stl", ".glb")
-
-
-def is_mesh_file(shape: str | None) -> bool:
-    """Whether a shape is the path of a mesh, and not the name of a built-in shape."""
-    return shape is not None and shape.lower().endswith(MESH_SUFFIXES)
-
-
 class SceneConfig(Section):
     """A simulated object with its true law and the prior of its reconstruction, a captured object, or a splat."""
 
@@ -99,6 +92,9 @@ class SceneConfig(Section):
     density: Annotated[float, Field(gt=0)] | SplitDensityConfig = Field(
         1000.0,
         description="mass density [kg/m^3], or two at t = 0: {axis: x, at: 0.5, below: 800, above: 1200}",
+    )
+    colliders: tuple[ColliderConfig, ...] = Field(
+        (), description="obstacles, in addition to the faces of the cube"
     )
     law: LawConfig | None = Field(description="the true material, used by the ground truth only")
     truth: TruthConfig = Field(TruthConfig(), description="resolution of the ground truth")

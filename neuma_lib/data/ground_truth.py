@@ -16,6 +16,7 @@ import torch
 import trimesh
 from torch import Tensor
 
+from neuma_lib.errors import InputError
 from neuma_lib.geometry.volume import check_apart, sample_tracers, sample_volume
 from neuma_lib.mechanics.density import Density, density_at
 from neuma_lib.mechanics.law import Law
@@ -111,6 +112,11 @@ def simulate_ground_truth(
         for k in range(2)
     ]
     together = State.joined(solids)
+    for k, collider in enumerate(model.colliders):
+        inside = int((collider.surface(together.x)[0] < 0).sum())
+        if inside:
+            problem = f"the {collider.shape} contains {inside} of {len(together.x)} particles at the start"
+            raise InputError(f"colliders.{k}", problem, "Move the obstacle or the body")
     with torch.no_grad():
         path = rollout(
             model,

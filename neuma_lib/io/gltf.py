@@ -4,20 +4,29 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from neuma_lib.geometry.obstacles import Obstacle
 from neuma_lib.io.files import atomic
 
 _FLOAT, _UINT = 5126, 5125
+_ROUGH = {"metallicFactor": 0.0, "roughnessFactor": 0.9}
 _VERTICES, _FACES = 34962, 34963
 """Buffer targets of a mesh."""
 
 
 def write_glb(
-    path: str | Path, vertices: np.ndarray, faces: np.ndarray, times: np.ndarray, colors: np.ndarray
+    path: str | Path,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    times: np.ndarray,
+    colors: np.ndarray,
+    obstacles: Sequence[Obstacle] = (),
 ) -> None:
     """Write a moving surface, y up and in metres as glTF requires.
 
@@ -26,6 +35,7 @@ def write_glb(
         faces: (M, 3).
         times: (T,) ascending [s]; vertices are interpolated linearly in between.
         colors: (V, 3) sRGB in [0, 1].
+        obstacles: other nodes of the scene, with a pose at each time.
     """
     vertices = np.asarray(vertices, "<f4")
     frames, body, views, accessors = len(vertices), bytearray(), [], []
@@ -61,7 +71,7 @@ def write_glb(
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, "name": "body"}],
         "meshes": [{"name": "body", "primitives": [primitive], "weights": [0.0] * (frames - 1)}],
-        "materials": [{"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.9}}],
+        "materials": [{"pbrMetallicRoughness": _ROUGH}],
         "animations": [
             {"samplers": [animated], "channels": [{"sampler": 0, "target": {"node": 0, "path": "weights"}}]}
         ],
@@ -71,6 +81,26 @@ def write_glb(
     }
     if frames == 1:  # glTF does not allow empty lists
         del content["animations"], primitive["targets"], content["meshes"][0]["weights"]
+    for k, obstacle in enumerate(obstacles, 1):
+        corners = {"POSITION": add(np.asarray(obstacle.vertices, "<f4"), "VEC3", _VERTICES, bounds=True)}
+        triangles = add(np.asarray(obstacle.faces, "<u4").ravel(), "SCALAR", _FACES)
+        look = {"baseColorFactor": [*linear(obstacle.color), obstacle.opacity]}
+        content["materials"].append({"pbrMetallicRoughness": look | _ROUGH, "doubleSided": True})
+        part = {"attributes": corners, "indices": triangles, "material": k}
+        content["meshes"].append({"name": f"obstacle {k}", "primitives": [part]})
+        turns = Rotation.from_matrix(obstacle.poses[:, :3, :3]).as_quat(canonical=True)
+        turns[1:] *= np.cumprod(np.where((turns[1:] * turns[:-1]).sum(1, keepdims=True) < 0, -1, 1), axis=0)
+        motion = {"translation": obstacle.poses[:, :3, 3], "rotation": turns}
+        start = {name: values[0].tolist() for name, values in motion.items()}
+        content["nodes"].append({"mesh": k, "name": f"obstacle {k}", **start})
+        content["scenes"][0]["nodes"].append(k)
+        for name, values in motion.items() if obstacle.moves else ():
+            moved = content["animations"][0]
+            kind = "VEC3" if name == "translation" else "VEC4"
+            output = add(np.asarray(values, "<f4"), kind)
+            moved["channels"].append({"sampler": len(moved["samplers"]), "target": {"node": k, "path": name}})
+            moved["samplers"].append(animated | {"output": output})
+    content["buffers"][0]["byteLength"] = len(body)
     text = json.dumps(content, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     with atomic(path) as partial:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from neuma_lib.config.scenes import MESH_SUFFIXES
+from neuma_lib.config.obstacles import MESH_SUFFIXES
 from neuma_lib.errors import InputError
 from neuma_lib.io.child import arrays_from_child
 from neuma_lib.io.files import existing

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from neuma_lib.extras import require
+from neuma_lib.geometry.obstacles import Obstacle
 from neuma_lib.io.files import atomic
 from neuma_lib.io.gltf import linear
 
@@ -15,7 +17,12 @@ CODES_A_SECOND = 24.0
 
 
 def write_usd(
-    path: str | Path, vertices: np.ndarray, faces: np.ndarray, times: np.ndarray, colors: np.ndarray
+    path: str | Path,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    times: np.ndarray,
+    colors: np.ndarray,
+    obstacles: Sequence[Obstacle] = (),
 ) -> None:
     """Write a moving surface, y up, in metres; arguments as for `write_glb`. The suffix sets the format: usda, usdc.
 
@@ -36,10 +43,15 @@ def write_usd(
         root = UsdGeom.Xform.Define(stage, "/body")
         stage.SetDefaultPrim(root.GetPrim())
         Usd.ModelAPI(root).SetKind("component")
-        mesh = UsdGeom.Mesh.Define(stage, "/body/surface")
-        mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-        mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32)))
-        mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.asarray(faces, np.int32).ravel()))
+
+        def define(name: str, triangles: np.ndarray):
+            mesh = UsdGeom.Mesh.Define(stage, f"/body/{name}")
+            mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+            mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(triangles), 3, np.int32)))
+            mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.asarray(triangles, np.int32).ravel()))
+            return mesh
+
+        mesh = define("surface", faces)
         points, extent = mesh.CreatePointsAttr(), mesh.CreateExtentAttr()
         for code, frame in zip(codes, np.ascontiguousarray(vertices, np.float32), strict=True):
             points.Set(Vt.Vec3fArray.FromNumpy(frame), float(code))
@@ -47,4 +59,14 @@ def write_usd(
             extent.Set(Vt.Vec3fArray(ends), float(code))
         display_color = mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
         display_color.Set(Vt.Vec3fArray.FromNumpy(linear(colors).astype(np.float32)))
+        for k, obstacle in enumerate(obstacles, 1):
+            mesh = define(f"obstacle_{k}", obstacle.faces)
+            corners = np.ascontiguousarray(obstacle.vertices, np.float32)
+            mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(corners))
+            ends = [Gf.Vec3f(*end.tolist()) for end in (corners.min(axis=0), corners.max(axis=0))]
+            mesh.CreateExtentAttr(Vt.Vec3fArray(ends))
+            mesh.CreateDisplayColorAttr([Gf.Vec3f(*linear(obstacle.color).tolist())])
+            pose = mesh.AddTransformOp()
+            for code, matrix in zip(codes, obstacle.poses, strict=True):
+                pose.Set(Gf.Matrix4d(*matrix.T.ravel().tolist()), float(code))  # of row vectors
         stage.GetRootLayer().Save()

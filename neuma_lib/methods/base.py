@@ -126,7 +126,7 @@ class Problem:
     """Known quantities of a scene before a fit.
 
     Attributes:
-        simulation: constants of the simulator, as `MPM` takes them.
+        simulation: constants, as `neuma_lib.io.simulator.simulator` takes them.
         densities: density of the body of each video, as `density_at` takes it.
         exposure: how frames with an exposure are rendered, see `load_videos`.
         seed: of the project.

@@ -16,9 +16,9 @@ from neuma_lib.io.files import listed, write_json
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.images import load_videos
 from neuma_lib.io.particles import load_reconstruction, with_motion
+from neuma_lib.io.simulator import simulator
 from neuma_lib.mechanics.adaptor import AdaptableLaw
 from neuma_lib.methods.base import Files, FitRun, Problem
-from neuma_lib.sim.model import MPM
 from neuma_lib.splatting.observation import Observation
 
 
@@ -44,7 +44,7 @@ class Training:
         friction: float | None = None,
     ):
         self.settings, self.run, self._problem = settings, run, problem
-        mpm = MPM(**problem.simulation)
+        mpm = simulator(problem.simulation)
         self._mpm = mpm if friction is None else mpm.with_friction(friction)
         parts = zip(*(listed(inputs[name]) for name in ("particles", "binding", "gaussians")), strict=True)
         bodies = [

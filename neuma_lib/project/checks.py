@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from neuma_lib.config.scenes import is_mesh_file
+from neuma_lib.config.obstacles import ColliderConfig, is_mesh_file
 from neuma_lib.config.validation import hint
 from neuma_lib.errors import InputError
 from neuma_lib.mechanics.catalogue import COURANT_LIMIT, DEFINED_IN, check_law, longitudinal_modulus
@@ -107,9 +107,10 @@ def _scene_problems(settings: Config, own_captures: bool = False) -> Iterator[st
         where, world, plain = f"scenes.{name}", settings.scene_world(name), scene.plain()
         if own_captures:
             yield from map(str, prior_errors(settings, name))
+        yield from _mesh_problems(*settings.colliders(name))
         if scene.has_truth:
             truth = settings.scene_truth(name)
-            yield from _start_problems(where, plain, scene.dt, world["grid"])
+            yield from _start_problems(where, plain, scene.dt, world["grid"], *settings.colliders(name))
             yield from _courant_problem(f"{where}.law", plain["law"], plain["density"], truth.grid, truth.dt)
         if scene.splat:
             reach = plain["size"] * math.sqrt(3) / 2
@@ -140,15 +141,24 @@ def _view_problems(settings: Config) -> Iterator[str]:
 def _experiment_problems(settings: Config) -> Iterator[str]:
     for name, experiment in settings.experiments.items():
         truth = settings.experiment_truth(name)
+        if experiment.colliders is not None:
+            yield from _mesh_problems(*settings.colliders(name))
         for k, (body, plain) in enumerate(zip(experiment.bodies, settings.experiment_bodies(name))):
             where = f"experiments.{name}.bodies.{k}"
             if body.shape is not None:
-                yield from _start_problems(where, plain, truth.dt, truth.grid)
+                yield from _start_problems(where, plain, truth.dt, truth.grid, *settings.colliders(name))
             if experiment.dt is not None and plain["law"] is not None:
                 yield from _courant_problem(where, plain["law"], plain["density"], truth.grid, truth.dt)
 
 
-def _start_problems(where: str, body: Mapping[str, Any], dt: float, grid: int) -> Iterator[str]:
+def _start_problems(
+    where: str,
+    body: Mapping[str, Any],
+    dt: float,
+    grid: int,
+    obstacles: str,
+    colliders: Sequence[ColliderConfig],
+) -> Iterator[str]:
     """Problems of the shape, the position and the motion that a body starts with."""
     shape = body["shape"]
     if is_mesh_file(shape):
@@ -175,6 +185,13 @@ def _start_problems(where: str, body: Mapping[str, Any], dt: float, grid: int) -
                 f"{where}.{key}: the body extends from {axis} = {low:.3g} to {high:.3g} m, {wall}. Move it, or change "
                 f"size = {size:g} m"
             )
+    for k, collider in enumerate(colliders):
+        if _contains(collider, middle):
+            at = ", ".join(f"{coordinate:.3g}" for coordinate in middle)
+            yield (
+                f"{obstacles}.{k}: the {collider.shape} contains the centre [{at}] m of the body of {where}. Move one "
+                "of the two"
+            )
     reach = float(np.linalg.norm(half + size * np.abs(proportions.mass_centre)))
     yield from _speed_problem(where, body, reach, dt, grid)
 
@@ -182,7 +199,7 @@ def _start_problems(where: str, body: Mapping[str, Any], dt: float, grid: int) -
 def _contact_problems(settings: Config) -> Iterator[str]:
     """Scenes in whose videos not even the bounding box of the body touches a wall."""
     for name, scene in settings.scenes.items():
-        if scene.has_truth and scene.shape in SHAPES:
+        if scene.has_truth and scene.shape in SHAPES and not scene.colliders:
             world, seconds = settings.scene_world(name), settings.frame_steps(name)[-1] * scene.dt
             size = scene.size or SHAPES[scene.shape].size
             middle, turned = flight(scene.plain(), size, world["gravity"], seconds)
@@ -202,6 +219,32 @@ def _speed_problem(where: str, body: Mapping[str, Any], reach: float, dt: float,
             f"{where}.velocity: at up to {speed:.3g} m/s a particle crosses a grid cell of {1 / grid:.3g} m in a time "
             f"step of {dt:g} s. Reduce velocity, spin or dt"
         )
+
+
+def _contains(collider: ColliderConfig, point: np.ndarray) -> bool:
+    """Whether a point [m] is inside a collider at t = 0. Meshes are checked when the truth is simulated."""
+    from scipy.spatial.transform import Rotation
+
+    centre, rotation = collider.start
+    y = Rotation.from_rotvec(rotation).inv().apply(point - np.array(centre))
+    size = np.array(collider.size)
+    if collider.shape == "plane":
+        return y[1] < 0
+    if collider.shape == "box":
+        return bool((np.abs(y) < size).all())
+    half = size[0] if collider.shape == "capsule" else 0.0
+    y[1] -= np.clip(y[1], -half, half)
+    return not is_mesh_file(collider.shape) and bool(np.linalg.norm(y) < size[-1])
+
+
+def _mesh_problems(where: str, colliders: Sequence[ColliderConfig]) -> Iterator[str]:
+    """Files of the meshes of colliders that cannot be read."""
+    for k, collider in enumerate(colliders):
+        if is_mesh_file(collider.shape):
+            try:
+                _mesh_proportions(collider.shape)
+            except InputError as error:
+                yield f"{where}.{k}.shape: {error}"
 
 
 @cache

@@ -47,6 +47,7 @@ def scene_files(settings: Config, scene: str, methods: Sequence[str]) -> SceneFi
     )
     names = ("particles.h5", "binding.h5", "gaussians.ply", "velocity.json")
     constants = {name: section[name] for name in ("boundary", "contact")} | settings.scene_world(scene)
+    constants |= settings.obstacles(scene)
     return SceneFiles(
         name=scene,
         simulation={"dt": chosen.dt, **constants},

@@ -139,6 +139,8 @@ def _name(kind: Any) -> str:
         return _name(parts[0])
     if origin is Literal:
         return " or ".join(f"`{p}`" for p in parts)
+    if origin is tuple and len(set(parts)) > 1 and Ellipsis not in parts:
+        return f"list ({', '.join(map(_name, parts))})"
     if origin is tuple:
         return "list of " + _name(parts[0]) + ("" if Ellipsis in parts else f" ({len(parts)})")
     if origin is dict:

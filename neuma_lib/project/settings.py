@@ -22,6 +22,7 @@ from neuma_lib.config.figures import FiguresConfig
 from neuma_lib.config.gaussians import GaussiansConfig
 from neuma_lib.config.geometry import GeometryConfig
 from neuma_lib.config.identify import IdentifyConfig
+from neuma_lib.config.obstacles import ColliderConfig
 from neuma_lib.config.photographs import PhotographsConfig
 from neuma_lib.config.priors import PriorsConfig
 from neuma_lib.config.scenes import SceneConfig
@@ -152,6 +153,22 @@ class Config(Section):
             return {"grid": self.simulation.grid, "gravity": list(self.simulation.gravity)}
         gravity = [0.0, -GRAVITY * captured.scale, 0.0]  # all lengths of the room are scaled
         return {"grid": captured.grid or self.captures.grid, "gravity": gravity}
+
+    def obstacles(self, name: str) -> dict[str, Any]:
+        """Plain arguments of `neuma_lib.io.simulator.simulator` of a scene or an experiment with obstacles."""
+        _, colliders = self.colliders(name)
+        plain = [each.arguments() for each in colliders]
+        return {"contact": "particles", "colliders": plain} if plain else {}
+
+    def colliders(self, name: str) -> tuple[str, tuple[ColliderConfig, ...]]:
+        """Path of the key with the colliders of a scene or an experiment, and them."""
+        base, _ = self.replicate(name)
+        if base in self.experiments:
+            own = self.experiments[base]
+            if own.colliders is not None:
+                return f"experiments.{base}.colliders", own.colliders
+            base = own.bodies[0].scene
+        return f"scenes.{base}.colliders", self.scenes[base].colliders
 
     def scene_truth(self, name: str) -> TruthConfig:
         """Resolution of the ground truth of a scene. Only the particles of a converged truth may be null."""

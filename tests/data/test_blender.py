@@ -20,9 +20,11 @@ from neuma_lib.data.blender.bodies import make_body
 from neuma_lib.data.blender.libraries import explain_import_error
 from neuma_lib.data.blender.scene import Surface, render_dynamic, render_static
 from neuma_lib.geometry import shapes
+from neuma_lib.geometry.obstacles import obstacles
 from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.io.gltf import linear
 from neuma_lib.io.images import read_image_set
+from neuma_lib.sim.colliders import Collider
 from neuma_lib.splatting import viewpoints as cameras
 from neuma_lib.splatting.cameras import Cameras
 from tests.support.errors import refused
@@ -327,3 +329,32 @@ def test_locks_are_in_a_folder_of_the_user(tmp_path, monkeypatch):
     with pytest.raises(OSError):
         worker.own_lock(made.stem)
     assert not (tmp_path / "target").exists()
+
+
+@needs_blender
+def test_a_moving_obstacle_hides_the_body_in_its_mask(tmp_path):
+    """A wall in front of the left half of a ball, later of all of it, and far away at the end. The projection of its
+    edge is the border of the mask within 1 px: half a pixel of the border, and half of antialiasing.
+    """
+    body, _ = ball(64)
+    body = Surface(np.repeat(body.vertices, 3, axis=0), body.faces, body.colors)
+    views = cameras.video_views(body.points, 1, 64, 64)
+    collider = Collider("box", (0.2, 0.3, 0.01), (0.3, 0.3, 0.7), velocity=(0.2, 0.0, 0.0))
+    around = obstacles([collider], [0.0, 1.0, 10.0])
+    render_dynamic(body, views, [0, 1, 10], 1.0, tmp_path / "a", 8, obstacles=around)
+    render_dynamic(body, views, [0, 1, 10], 1.0, tmp_path / "b", 8)
+    images, alone = (read_image_set(tmp_path / name / "transforms.json") for name in ("a", "b"))
+    assert images.steps.tolist() == [0, 10] and alone.steps.tolist() == [0, 1, 10]  # without a hidden frame
+    edge = views.project(np.array([[0.5, 0.3, 0.71]]))[0, 0, 0]
+    (half, seen), (whole, _, last) = images.images, alone.images
+    np.testing.assert_array_equal(seen[..., 3], last[..., 3])
+    column = np.arange(64) + 0.5
+    assert not half[:, column < edge - 1, 3].any()
+    beyond = column > edge + 1
+    np.testing.assert_array_equal(half[:, beyond, 3], whole[:, beyond, 3])
+    opaque = beyond & (whole[..., 3] == 255)
+    # The denoiser, which sees the wall, changes colours by 0.4 of 255. A shadow of the wall would change them by 3.4.
+    assert np.abs(half[opaque].astype(int) - whole[opaque]).mean() < 2
+    # the colours show the wall, which is grey and darker than the white behind it
+    wall = half[32, int(edge) - 8, :3].astype(int)
+    assert np.ptp(wall) < 40 and wall.max() < 200 and (half[0, -1, :3] == 255).all()

@@ -12,6 +12,7 @@ import torch
 import trimesh
 from PIL import Image
 from plyfile import PlyData
+from scipy.spatial.transform import Rotation
 
 from neuma_lib.coupling.binding import Binding
 from neuma_lib.coupling.frames import axes_of, gaussians_at, local_rotations
@@ -21,9 +22,11 @@ from neuma_lib.data.blender.blend import write_blend
 from neuma_lib.evaluation.plotting.rendering import frontal, renders, seen_around
 from neuma_lib.evaluation.video import write_gif, write_mp4
 from neuma_lib.geometry.moving_surface import moving_surface, vertex_colours
+from neuma_lib.geometry.obstacles import obstacles
 from neuma_lib.io.gaussians import save_gaussians
 from neuma_lib.io.gltf import linear, write_glb
 from neuma_lib.io.usd import write_usd
+from neuma_lib.sim.colliders import Collider
 from neuma_lib.splatting.extent import SEEN, outermost
 from neuma_lib.splatting.gaussians import covariances, rotations
 from neuma_lib.splatting.spherical_harmonics import colours
@@ -115,6 +118,15 @@ def surface():
     return vertices, np.asarray(mesh.faces), np.array([0.0, 0.1, 0.25, 0.5]), colors
 
 
+@pytest.fixture(scope="module")
+def around(surface):
+    """A box at rest and a capsule that falls and turns by 3 rad, at the times of the surface."""
+    turning = Collider(
+        "capsule", (0.1, 0.05), (0.2, 0.5, 0.5), (0.3, 0.0, 0.0), velocity=(0, -0.5, 0), spin=(0, 0, 6)
+    )
+    return obstacles([Collider("box", (0.1, 0.2, 0.3), (0.7, 0.2, 0.5)), turning], surface[2])
+
+
 def test_vertices_have_the_colours_of_the_gaussians_around_them():
     g = ball(2000)
     g = dataclasses.replace(g, sh0=(g.means[:, None] > 0).float() * 2 - 1)  # by octant
@@ -126,10 +138,11 @@ def test_vertices_have_the_colours_of_the_gaussians_around_them():
     np.testing.assert_allclose(rgb[inside], expected[inside], atol=1e-6)
 
 
-def test_gltf_holds_the_motion(tmp_path, surface):
+def test_gltf_holds_the_motion(tmp_path, surface, around):
     vertices, faces, times, colors = surface
-    write_glb(tmp_path / "a.glb", *surface)
-    mesh = next(iter(trimesh.load(tmp_path / "a.glb", process=False).geometry.values()))
+    write_glb(tmp_path / "a.glb", *surface, around)
+    loaded = trimesh.load(tmp_path / "a.glb", process=False)
+    mesh = next(iter(loaded.geometry.values()))
     np.testing.assert_array_equal(mesh.vertices, vertices[0].astype(np.float32))
     np.testing.assert_array_equal(mesh.faces, faces)
     data = (tmp_path / "a.glb").read_bytes()
@@ -157,19 +170,34 @@ def test_gltf_holds_the_motion(tmp_path, surface):
     animated = base + np.einsum("tk,kvc->tvc", weights, targets)
     np.testing.assert_allclose(animated, vertices, atol=2 * np.finfo(np.float32).eps)  # metres, below 1
     np.testing.assert_allclose(array(primitive["attributes"]["COLOR_0"]), linear(colors), atol=1e-7)
+    for k, obstacle in enumerate(around, 1):  # another reader applies the pose at the start
+        pose, name = loaded.graph[f"obstacle {k}"]
+        placed = trimesh.transform_points(loaded.geometry[name].vertices, pose)
+        np.testing.assert_allclose(placed, obstacle.placed(0), atol=1e-6)
+    channels = {
+        (c["target"]["node"], c["target"]["path"]): c["sampler"] for c in content["animations"][0]["channels"]
+    }
+    assert set(channels) == {(0, "weights"), (2, "translation"), (2, "rotation")}
+    moved, turned = (
+        array(content["animations"][0]["samplers"][channels[2, path]]["output"])
+        for path in ("translation", "rotation")
+    )
+    np.testing.assert_allclose(moved, around[1].poses[:, :3, 3], atol=1e-7)
+    np.testing.assert_allclose(Rotation.from_quat(turned).as_matrix(), around[1].poses[:, :3, :3], atol=1e-6)
+    assert ((turned[1:] * turned[:-1]).sum(axis=1) > 0).all()  # the shorter way between two frames
     write_glb(tmp_path / "b.glb", *(part[:1] if k in (0, 2) else part for k, part in enumerate(surface)))
     still = (tmp_path / "b.glb").read_bytes()
     assert b"animations" not in still and b"targets" not in still
 
 
 @pytest.mark.parametrize("kind", ["usda", "usdc"])
-def test_usd_holds_the_motion_and_its_own_validators_find_nothing(tmp_path, surface, kind):
+def test_usd_holds_the_motion_and_its_own_validators_find_nothing(tmp_path, surface, around, kind):
     pytest.importorskip("pxr")
     from pxr import Usd, UsdGeom, UsdValidation
 
     vertices, faces, times, _ = surface
     for again in range(2):
-        write_usd(tmp_path / f"{again}.{kind}", *surface)
+        write_usd(tmp_path / f"{again}.{kind}", *surface, around)
     assert (tmp_path / f"0.{kind}").read_bytes() == (tmp_path / f"1.{kind}").read_bytes()
     assert len(list(tmp_path.iterdir())) == 2
     stage = Usd.Stage.Open(str(tmp_path / f"0.{kind}"))
@@ -181,6 +209,12 @@ def test_usd_holds_the_motion_and_its_own_validators_find_nothing(tmp_path, surf
             np.array(mesh.GetPointsAttr().Get(time * rate)), frame.astype(np.float32)
         )
     np.testing.assert_array_equal(np.array(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3), faces)
+    for k, obstacle in enumerate(around, 1):
+        part = UsdGeom.Mesh(stage.GetDefaultPrim().GetChild(f"obstacle_{k}"))
+        for frame, time in enumerate(times):
+            pose = np.array(part.ComputeLocalToWorldTransform(time * rate))
+            corners = np.array(part.GetPointsAttr().Get()) @ pose[:3, :3] + pose[3, :3]
+            np.testing.assert_allclose(corners, obstacle.placed(frame), atol=1e-6)
     assert UsdGeom.GetStageUpAxis(stage) == "Y" and UsdGeom.GetStageMetersPerUnit(stage) == 1
     validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
     assert len(validators) > 10
@@ -239,10 +273,10 @@ def test_a_film_cuts_nothing_that_is_seen(body):
 
 
 @pytest.mark.slow
-def test_blend_holds_the_motion(tmp_path, surface):
+def test_blend_holds_the_motion(tmp_path, surface, around):
     """Read back by another Blender process; between two frames the surface is between them."""
     vertices, _, times, _ = surface
-    write_blend(tmp_path / "a.blend", tmp_path / "a.png", *surface)
+    write_blend(tmp_path / "a.blend", tmp_path / "a.png", *surface, around)
     with Image.open(tmp_path / "a.png") as image:
         alpha = np.asarray(image)[..., 3]
     assert 0.005 < (alpha > 128).mean() < 0.5
@@ -251,4 +285,6 @@ def test_blend_holds_the_motion(tmp_path, surface):
     np.testing.assert_allclose(read["co"][:4], vertices, atol=1e-5)
     np.testing.assert_allclose(read["co"][4], vertices[1:3].mean(axis=0), atol=1e-5)
     np.testing.assert_allclose(read["world"][:3, :3] @ [0, 1, 0], [0, 0, 1], atol=1e-6)  # y is up: z
+    stand = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+    np.testing.assert_allclose(read["poses"][:, :4], [stand @ each.poses for each in around], atol=1e-5)
     assert Path(tmp_path / "a.blend").stat().st_size > 1000

@@ -48,6 +48,7 @@ rule ground_truth:
     input:
         kernels=kernels("geometry", "simulation"),
         meshes=solid_meshes(),
+        obstacles=obstacle_meshes,
     output:
         truth=f"{DATA}/{{scene}}/truth.h5",
     wildcard_constraints:
@@ -57,7 +58,9 @@ rule ground_truth:
         mem_mb=truth_memory,
     params:
         bodies=body_settings("shape", "size", "height", "center", "velocity", "spin", "density", "law"),
-        simulation=lambda wildcards: simulator(truth_settings(wildcards).dt, truth_settings(wildcards).grid),
+        simulation=lambda wildcards: simulator(
+            subject(wildcards), truth_settings(wildcards).dt, truth_settings(wildcards).grid
+        ),
         dt=time_step,
         frames=frame_steps,
         particles=lambda wildcards: truth_settings(wildcards).particles,

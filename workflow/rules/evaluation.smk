@@ -45,6 +45,7 @@ rule evaluate:
         truth=of_data("truth.h5"),
         tracers=of_replicate("tracers.h5"),
         velocity=evaluated_start,
+        obstacles=obstacle_meshes,
     output:
         rollout=f"{RESULTS}/{{scene}}/{{method}}/rollout.h5",
         metrics=f"{RESULTS}/{{scene}}/{{method}}/metrics.json",
@@ -73,6 +74,7 @@ rule predict:
         kernels=of_bodies(model_kernels),
         transforms=f"{DATA}/{{scene}}/dynamic/transforms.json",
         velocity=capture_start,
+        obstacles=obstacle_meshes,
     output:
         rollout=f"{RESULTS}/{{scene}}/{{method}}/rollout.h5",
         report=f"{RESULTS}/{{scene}}/{{method}}/prediction.json",

@@ -45,6 +45,7 @@ rule export_surface:
     input:
         **MOVED,
         mesh=of_replicate("mesh.ply"),
+        obstacles=obstacle_meshes,
     output:
         surface=f"{EXPORT}/surface.{{kind}}",
     wildcard_constraints:
@@ -52,6 +53,7 @@ rule export_surface:
         kind="glb|usda|usdc",
     params:
         particle_source=of_bodies(shared_particle_source),
+        obstacles=lambda wildcards: SETTINGS.obstacles(subject(wildcards)),
     script:
         "../scripts/export_surface.py"
 
@@ -60,6 +62,7 @@ rule export_blend:
     input:
         **MOVED,
         mesh=of_replicate("mesh.ply"),
+        obstacles=obstacle_meshes,
     output:
         blend=f"{EXPORT}/motion.blend",
         picture=f"{EXPORT}/motion.png",
@@ -67,6 +70,7 @@ rule export_blend:
         scene=SCENE_OR_EXPERIMENT,
     params:
         particle_source=of_bodies(shared_particle_source),
+        obstacles=lambda wildcards: SETTINGS.obstacles(subject(wildcards)),
     script:
         "../scripts/export_blend.py"
 

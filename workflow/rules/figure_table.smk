@@ -81,7 +81,7 @@ def scene_constants(scenes):
     plain = {scene: SETTINGS.scene(scene).plain() for scene in scenes}
     return {
         scene: {name: values[name] for name in ("dt", "density", "law")}
-        | {"simulation": simulator(values["dt"])}
+        | {"simulation": simulator(scene, values["dt"])}
         for scene, values in plain.items()
     }
 

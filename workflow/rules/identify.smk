@@ -12,6 +12,7 @@ for views in ("", "+views={views}"):
             mesh=of_each_video(of_replicate("mesh.ply")),
             transforms=of_each_video(of_data("dynamic/transforms.json")),
             velocity=of_each_video(of_replicate("velocity.json")),
+            obstacles=obstacle_meshes,
         output:
             identified=f"{RESULTS}/{{scene}}/identified{views}.json",
         resources:

@@ -59,6 +59,7 @@ for fitted in (method for method in KINDS.values() if method.product):
         input:
             unpack(of_case(fit_files)),
             kernels=kernels(*fitted.fit_kernels),
+            obstacles=obstacle_meshes,
         output:
             product=f"{RESULTS}/{{scene}}/{{method}}/{fitted.product}",
             history=f"{RESULTS}/{{scene}}/{{method}}/history.json",

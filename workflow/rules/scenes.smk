@@ -2,7 +2,7 @@
 
 from types import SimpleNamespace
 
-from neuma_lib.config.scenes import is_mesh_file
+from neuma_lib.config.obstacles import is_mesh_file
 from neuma_lib.project import paths
 from neuma_lib.project.settings import NO_TRUTH
 from workflow.inputs import image_list
@@ -167,7 +167,13 @@ truth_settings = by_subject(SETTINGS.scene_truth, SETTINGS.experiment_truth)
 def simulation_settings(wildcards):
     """Constants of the simulator for a scene or experiment."""
     world = by_subject(SETTINGS.scene_world, lambda experiment: {})(wildcards)
-    return simulator(time_step(wildcards)) | world
+    return simulator(subject(wildcards), time_step(wildcards)) | world
+
+
+def obstacle_meshes(wildcards):
+    """Meshes of the colliders of a scene or experiment."""
+    colliders = SETTINGS.obstacles(subject(wildcards)).get("colliders", [])
+    return [each["shape"] for each in colliders if is_mesh_file(each["shape"])]
 
 
 def exposure(wildcards):
@@ -175,10 +181,11 @@ def exposure(wildcards):
     return {"dt": SETTINGS.scene(wildcards.scene).dt, "exposure_samples": SETTINGS.dataset.exposure_samples}
 
 
-def simulator(dt, grid=None):
-    """Constants of the simulator with a time step [s], on the reconstruction's grid unless another is given."""
+def simulator(name, dt, grid=None):
+    """Constants of the simulator for a scene or experiment, on the reconstruction's grid unless another is given."""
     section = SETTINGS.simulation.plain() | ({"grid": grid} if grid else {})
-    return {"dt": dt, **{name: section[name] for name in ("grid", "gravity", "boundary", "contact")}}
+    constants = {key: section[key] for key in ("grid", "gravity", "boundary", "contact")}
+    return {"dt": dt, **constants, **SETTINGS.obstacles(name)}
 
 
 def densities_of(scenes):

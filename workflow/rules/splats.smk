@@ -51,6 +51,7 @@ use rule predict as predict_splat with:
         **body_files(),
         kernels=of_bodies(model_kernels),
         velocity=splat_start,
+        obstacles=obstacle_meshes,
     output:
         rollout=f"{RESULTS}/{{scene}}/{{method}}/rollout.h5",
         report=f"{RESULTS}/{{scene}}/{{method}}/motion.json",
@@ -58,7 +59,11 @@ use rule predict as predict_splat with:
         scene=SPLAT_SCENE,
     params:
         method=of_bodies(model_parameter),
-        simulation=splat_clock(lambda dt, frames: simulator(dt)),
+        simulation=checked(
+            lambda wildcards: simulator(
+                wildcards.scene, cases.motion_clock(SETTINGS, wildcards.scene, wildcards.method)[0]
+            )
+        ),
         densities=of_case(lambda case: [SETTINGS.scene(case.moved).plain()["density"]]),
         total=of_bodies(carries_total),
         particle_source=of_bodies(shared_particle_source),

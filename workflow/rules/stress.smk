@@ -6,6 +6,7 @@ rule visited:
         **body_files(),
         kernels=kernels("simulation"),
         velocity=of_replicate("velocity.json"),
+        obstacles=obstacle_meshes,
     output:
         visited=f"{RESULTS}/{{scene}}/visited.h5",
     resources:

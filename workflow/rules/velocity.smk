@@ -6,6 +6,7 @@ rule velocity:
         **body_files(),
         kernels=kernels("laws", "rendering"),
         transforms=of_data("dynamic/transforms.json"),
+        obstacles=obstacle_meshes,
         prior=checked(
             lambda wildcards: paths.prior_file(
                 SETTINGS, wildcards.scene, SETTINGS.scene(wildcards.scene).prior

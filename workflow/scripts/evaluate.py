@@ -7,7 +7,7 @@ from neuma_lib.device import choose_device
 from neuma_lib.evaluation.motion import evaluate
 from neuma_lib.io.files import write_json
 from neuma_lib.io.hdf5 import read_arrays, write_arrays
-from neuma_lib.sim.model import MPM
+from neuma_lib.io.simulator import simulator
 from workflow.motion import Prediction
 from workflow.stage import run_script
 
@@ -21,7 +21,7 @@ def main(inputs, output, params, run) -> None:
     start, counts = prediction.start(params.densities, params.particle_source)
     model = prediction.model(dt, counts)
     evaluation = evaluate(
-        MPM(**params.simulation),
+        simulator(params.simulation),
         model,
         start.to(device),
         params.frames,

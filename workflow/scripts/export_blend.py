@@ -2,9 +2,11 @@
 
 from neuma_lib.data.blender.blend import write_blend
 from neuma_lib.geometry.moving_surface import moving_surface, vertex_colours
+from neuma_lib.geometry.obstacles import obstacles
 from neuma_lib.io.gaussians import load_gaussians
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.mesh import read_mesh
+from neuma_lib.io.simulator import with_obstacles
 from workflow.stage import run_script
 
 
@@ -15,9 +17,9 @@ def main(inputs, output, params, run) -> None:
         moving_surface(mesh, path["x"]),
         vertex_colours(mesh, load_gaussians(inputs.gaussians)),
     )
-    write_blend(
-        output.blend, output.picture, vertices, mesh.faces, path["frames"] * attributes["dt"], colours
-    )
+    times = path["frames"] * attributes["dt"]
+    around = obstacles(with_obstacles(params.obstacles).get("colliders", ()), times)
+    write_blend(output.blend, output.picture, vertices, mesh.faces, times, colours, around)
     run.log(f"{vertices.shape[0]} frames of {vertices.shape[1]} vertices")
 
 

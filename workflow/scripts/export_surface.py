@@ -3,10 +3,12 @@
 from pathlib import Path
 
 from neuma_lib.geometry.moving_surface import moving_surface, vertex_colours
+from neuma_lib.geometry.obstacles import obstacles
 from neuma_lib.io.gaussians import load_gaussians
 from neuma_lib.io.gltf import write_glb
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.mesh import read_mesh
+from neuma_lib.io.simulator import with_obstacles
 from neuma_lib.io.usd import write_usd
 from workflow.stage import run_script
 
@@ -17,7 +19,9 @@ def main(inputs, output, params, run) -> None:
     vertices = moving_surface(mesh, path["x"])
     write = write_glb if Path(output.surface).suffix == ".glb" else write_usd
     colours = vertex_colours(mesh, load_gaussians(inputs.gaussians))
-    write(output.surface, vertices, mesh.faces, path["frames"] * attributes["dt"], colours)
+    times = path["frames"] * attributes["dt"]
+    around = obstacles(with_obstacles(params.obstacles).get("colliders", ()), times)
+    write(output.surface, vertices, mesh.faces, times, colours, around)
     run.log(f"{vertices.shape[0]} frames of {vertices.shape[1]} vertices")
 
 

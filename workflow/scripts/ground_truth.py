@@ -9,8 +9,8 @@ from neuma_lib.device import choose_device
 from neuma_lib.geometry.shapes import place
 from neuma_lib.io.files import listed
 from neuma_lib.io.hdf5 import write_arrays
+from neuma_lib.io.simulator import simulator
 from neuma_lib.mechanics.analytic import analytic_law
-from neuma_lib.sim.model import MPM
 from workflow.inputs import solid
 from workflow.stage import run_script
 
@@ -42,7 +42,7 @@ def simulated(model, inputs, params):
 
 
 def main(inputs, output, params, run) -> None:
-    model = MPM(**params.simulation)
+    model = simulator(params.simulation)
     converged = params.particles is None
     truth = simulated(model, inputs, params)
     change = (

@@ -12,7 +12,7 @@ from neuma_lib.io.files import listed, read_json, write_json
 from neuma_lib.io.images import load_videos
 from neuma_lib.io.mesh import read_mesh
 from neuma_lib.io.particles import load_reconstruction
-from neuma_lib.sim.model import MPM
+from neuma_lib.io.simulator import simulator
 from workflow.stage import run_script
 
 
@@ -52,7 +52,7 @@ def main(inputs, output, params, run) -> None:
         for (_, body, _), mesh, density in zip(videos, meshes, params.densities, strict=True)
     ]
     identification = identify(
-        MPM(**params.simulation),
+        simulator(params.simulation),
         *videos[0],
         settings,
         params.published,

@@ -10,7 +10,7 @@ from neuma_lib.evaluation.motion import energy_gain_after
 from neuma_lib.io.files import write_json
 from neuma_lib.io.hdf5 import write_arrays
 from neuma_lib.io.images import filmed_steps, read_transforms
-from neuma_lib.sim.model import MPM
+from neuma_lib.io.simulator import simulator
 from workflow.motion import Prediction
 from workflow.stage import run_script
 
@@ -19,7 +19,7 @@ def main(inputs, output, params, run) -> None:
     device, dt = choose_device(params.device), params.simulation["dt"]
     prediction = Prediction(inputs, params.method)
     start, counts = prediction.start(params.densities, params.particle_source)
-    start, model, mpm = start.to(device), prediction.model(dt, counts), MPM(**params.simulation)
+    start, model, mpm = start.to(device), prediction.model(dt, counts), simulator(params.simulation)
     frames = params.frames
     if params.cameras:
         steps = filmed_steps(inputs.transforms, range(len(params.cameras)), **params.exposure)

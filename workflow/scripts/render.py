@@ -5,9 +5,11 @@ from pathlib import Path
 from neuma_lib.config.blender import AppearanceConfig, ImagesConfig
 from neuma_lib.data.blender.bodies import make_body
 from neuma_lib.data.blender.scene import render_dynamic, render_static
+from neuma_lib.geometry.obstacles import obstacles
 from neuma_lib.geometry.shapes import place
-from neuma_lib.io.files import listed
+from neuma_lib.io.files import listed, parse_json
 from neuma_lib.io.hdf5 import read_arrays
+from neuma_lib.io.simulator import with_obstacles
 from neuma_lib.splatting.viewpoints import static_views, video_views
 from workflow.inputs import solid
 from workflow.stage import run_script
@@ -26,7 +28,10 @@ def main(inputs, output, params, run) -> None:
     viewpoints = video_views if params.moving else static_views
     views = viewpoints(body.points, images.views, images.width, images.height)
     folder = Path(output.transforms).parent
-    how = (folder, images.samples, params.threads, run.progress, params.device)
+    simulation = with_obstacles(parse_json(attributes.get("simulation", "{}"), inputs.truth))
+    times = [step * attributes["dt"] for step in steps]
+    around = obstacles(simulation.get("colliders", ()), times)
+    how = (folder, images.samples, params.threads, run.progress, params.device, around)
     if params.moving:
         render_dynamic(body, views, steps, attributes["dt"], *how)
     else:

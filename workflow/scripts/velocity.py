@@ -9,14 +9,14 @@ from neuma_lib.io.files import write_json
 from neuma_lib.io.images import load_videos
 from neuma_lib.io.laws import load_prior
 from neuma_lib.io.particles import load_reconstruction
-from neuma_lib.sim.model import MPM
+from neuma_lib.io.simulator import simulator
 from workflow.stage import run_script
 
 
 def main(inputs, output, params, run) -> None:
     settings = VelocityConfig(**params.velocity)
     device = choose_device(params.device)
-    model = MPM(**params.simulation)
+    model = simulator(params.simulation)
     law = load_prior(inputs.prior, device, model.dt)
     body = load_reconstruction(inputs.particles, inputs.binding, inputs.gaussians, params.density)
     body = body.to(torch.float32, device)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from neuma_lib.data.blender.scene import run_worker
+from neuma_lib.data.blender.scene import obstacle_arrays, run_worker
+from neuma_lib.geometry.obstacles import Obstacle
 from neuma_lib.io.files import atomic
 from neuma_lib.io.gltf import linear
 from neuma_lib.splatting.viewpoints import video_views
@@ -24,6 +26,7 @@ def write_blend(
     faces: np.ndarray,
     times: np.ndarray,
     colors: np.ndarray,
+    obstacles: Sequence[Obstacle] = (),
 ) -> None:
     """Write a moving surface, and a render of its last frame from the front; other arguments as for `write_glb`.
 
@@ -39,7 +42,7 @@ def write_blend(
         np.savez(
             job, vertices=np.asarray(vertices, np.float32), faces=np.asarray(faces, np.int32), times=times,
             colors=linear(colors).astype(np.float32), pose=views.c2w[0], focal=views.focal, size=np.array(_SIZE),
-            samples=_SAMPLES, threads=1, preview_time=times[-1],
+            samples=_SAMPLES, threads=1, preview_time=times[-1], **obstacle_arrays(obstacles),
         )  # fmt: skip
         run_worker(_WORKER, job)
         for source, target in ((job.with_name("motion.blend"), path), (job.with_name("proof.png"), picture)):

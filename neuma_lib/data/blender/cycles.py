@@ -142,6 +142,50 @@ def _grain_nodes(radius: float, material: bpy.types.Material) -> bpy.types.NodeT
     return tree
 
 
+class Obstacles:
+    """Rigid grey objects of a job, which cast shadows in pictures and none in images with masks.
+
+    The colours of the body in the images then do not depend on obstacles, and their masks end where an obstacle hides
+    the body.
+    """
+
+    def __init__(self, job: dict[str, np.ndarray], shadows: bool):
+        self.poses, self.objects = job["obstacle_poses"], []
+        for k, (*color, opacity) in enumerate(job["obstacle_colors"].tolist()):
+            mesh = bpy.data.meshes.new("obstacle")
+            mesh.from_pydata(job[f"obstacle_{k}_vertices"].tolist(), [], job[f"obstacle_{k}_faces"].tolist())
+            mesh.materials.append(self._material(color, opacity))
+            each = bpy.data.objects.new("obstacle", mesh)
+            each.visible_shadow = each.visible_diffuse = shadows
+            bpy.context.scene.collection.objects.link(each)
+            self.objects.append(each)
+
+    @staticmethod
+    def _material(color: list[float], opacity: float) -> bpy.types.Material:
+        material = bpy.data.materials.new("obstacle")
+        material.use_nodes = True
+        nodes, links = material.node_tree.nodes, material.node_tree.links
+        nodes.clear()
+        diffuse, clear = nodes.new("ShaderNodeBsdfDiffuse"), nodes.new("ShaderNodeBsdfTransparent")
+        mix, output = nodes.new("ShaderNodeMixShader"), nodes.new("ShaderNodeOutputMaterial")
+        diffuse.inputs["Color"].default_value = (*color, 1.0)
+        mix.inputs["Fac"].default_value = opacity
+        for shader, place in ((clear, 1), (diffuse, 2)):
+            links.new(shader.outputs["BSDF"], mix.inputs[place])
+        links.new(mix.outputs["Shader"], output.inputs["Surface"])
+        return material
+
+    def show(self, frame: int) -> None:
+        """Set the poses of a frame."""
+        for each, poses in zip(self.objects, self.poses, strict=True):
+            each.matrix_world = Matrix(poses[frame].tolist())
+
+    def cut_out(self, transparent: bool) -> None:
+        """Whether obstacles are transparent, and hide the body nevertheless."""
+        for each in self.objects:
+            each.is_holdout = transparent
+
+
 class Body:
     """The object of a job, with the geometry of one frame."""
 

@@ -42,9 +42,7 @@ def main(path: str) -> None:
     for time, key in zip(times, keys.key_blocks, strict=True):
         keys.eval_time = key.frame
         keys.keyframe_insert("eval_time", frame=float(time) * RATE)
-    for curve in keys.animation_data.action.fcurves:
-        for point in curve.keyframe_points:
-            point.interpolation = "LINEAR"
+    _interpolate_linearly(keys)
     scene.frame_start, scene.frame_end = 0, max(1, int(np.ceil(times[-1] * RATE)))
     camera = cycles.add_camera(float(job["focal"]), width)
     cycles.place(camera, job["pose"])
@@ -52,6 +50,7 @@ def main(path: str) -> None:
     bpy.context.view_layer.update()
     for each in scene.objects:
         each.matrix_world = stand @ each.matrix_world
+    _animate(cycles.Obstacles(job, shadows=True), times, stand)
     preview = float(job["preview_time"] * RATE)
     scene.frame_set(int(preview), subframe=preview % 1)
     cycles.render(folder / "proof.png")
@@ -59,6 +58,27 @@ def main(path: str) -> None:
     # keep the folder of the render out of the file
     scene.render.filepath = ""
     bpy.ops.wm.save_as_mainfile(filepath=str(folder / "motion.blend"), compress=True)
+
+
+def _animate(obstacles: cycles.Obstacles, times: np.ndarray, stand: Matrix) -> None:
+    """Key frames of the poses of obstacles, rotated by a matrix."""
+    for frame, time in enumerate(times):
+        obstacles.show(frame)
+        for each in obstacles.objects:
+            before = each.rotation_quaternion.copy()
+            each.rotation_mode = "QUATERNION"
+            each.matrix_world = stand @ each.matrix_world
+            each.rotation_quaternion.make_compatible(before)
+            for path in ("location", "rotation_quaternion"):
+                each.keyframe_insert(path, frame=float(time) * RATE)
+    for each in obstacles.objects:
+        _interpolate_linearly(each)
+
+
+def _interpolate_linearly(animated: bpy.types.ID) -> None:
+    for curve in animated.animation_data.action.fcurves:
+        for point in curve.keyframe_points:
+            point.interpolation = "LINEAR"
 
 
 if __name__ == "__main__":

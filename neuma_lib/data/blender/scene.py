@@ -19,10 +19,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from neuma_lib.data.blender import worker
 from neuma_lib.data.blender.libraries import explain_import_error
 from neuma_lib.errors import InputError
+from neuma_lib.geometry.obstacles import Obstacle
 from neuma_lib.io.gltf import linear
 from neuma_lib.io.images import write_transforms
 from neuma_lib.io.processes import start_child
@@ -107,6 +109,8 @@ def render_images(
     threads: int = 1,
     progress: Progress | None = None,
     device: str = "cpu",
+    obstacles: Sequence[Obstacle] = (),
+    matte: bool = True,
 ) -> None:
     """Render shots to RGBA PNG files.
 
@@ -120,6 +124,9 @@ def render_images(
         threads: CPU cores for Blender.
         progress: called with the numbers of finished and of all images.
         device: "cpu", "cuda", or "auto", CUDA if Blender has a device.
+        obstacles: other objects, with a pose for each frame.
+        matte: alpha is the mask of the visible part of the object. Obstacles and white surroundings are in the colours,
+            where alpha is 0. Otherwise alpha is the mask of everything.
 
     Raises:
         InputError: Blender cannot be imported (the message names the package to install), or it has no CUDA device but
@@ -142,13 +149,37 @@ def render_images(
             samples=samples,
             threads=threads,
             device=device,
+            matte=matte,
+            **obstacle_arrays(obstacles),
         )
         job.write_bytes(content.getbuffer())
         run_worker(worker.__name__, job, len(shots), progress)
         for index, name in enumerate(names):
             image = Path(folder) / f"{index:05d}.png"
+            if obstacles and matte:
+                _add_surroundings(image, image.with_stem(f"{image.stem}_all"))
             image.write_bytes(_pixels_only(image.read_bytes()))
             os.replace(image, out_dir / name)
+
+
+def obstacle_arrays(obstacles: Sequence[Obstacle]) -> dict[str, np.ndarray]:
+    """Arrays of obstacles for the Blender process."""
+    arrays = {
+        "obstacle_poses": np.array([each.poses for each in obstacles]),
+        "obstacle_colors": np.array([(*linear(each.color), each.opacity) for each in obstacles]),
+    }
+    for k, each in enumerate(obstacles):
+        arrays |= {f"obstacle_{k}_vertices": each.vertices, f"obstacle_{k}_faces": each.faces}
+    return arrays
+
+
+def _add_surroundings(image: Path, whole: Path) -> None:
+    """Give the pixels of a matte that are transparent the colours of a picture with obstacles, over white."""
+    pixels, others = (np.array(Image.open(path).convert("RGBA")) for path in (image, whole))
+    share = others[..., 3:] / 255
+    behind = (others[..., :3] * share + 255 * (1 - share)).round().astype(np.uint8)
+    pixels[..., :3] = np.where(pixels[..., 3:] > 0, pixels[..., :3], behind)
+    Image.fromarray(pixels).save(image)
 
 
 def _pixels_only(png: bytes) -> bytes:
@@ -209,11 +240,14 @@ def render_static(
     threads: int = 1,
     progress: Progress | None = None,
     device: str = "cpu",
+    obstacles: Sequence[Obstacle] = (),
 ) -> None:
-    """Render frame 0 from every camera to ``s_<view>.png``, and write transforms.json."""
+    """Render frame 0 from every camera to ``s_<view>.png``, and write transforms.json of those that see the object."""
     shots = [(0, view) for view in range(len(views))]
     names = [f"s_{view:03d}.png" for _, view in shots]
-    _render_set(geometry, views, shots, names, [0], [0.0], out_dir, samples, threads, progress, device)
+    _render_set(
+        geometry, views, shots, names, [0], [0.0], out_dir, obstacles, samples, threads, progress, device
+    )
 
 
 def render_dynamic(
@@ -226,8 +260,11 @@ def render_dynamic(
     threads: int = 1,
     progress: Progress | None = None,
     device: str = "cpu",
+    obstacles: Sequence[Obstacle] = (),
 ) -> None:
     """Render every frame from every camera to ``d_<view>_<step>.png``, and write transforms.json.
+
+    Frames in which an obstacle hides the object are not listed.
 
     Args:
         steps: simulation step of each frame of ``geometry``.
@@ -238,13 +275,19 @@ def render_dynamic(
     shots = [(frame, view) for frame in range(len(geometry)) for view in range(len(views))]
     names = [f"d_{view}_{steps[frame]:04d}.png" for frame, view in shots]
     times = [float(step) * dt for step in steps]
-    _render_set(geometry, views, shots, names, steps, times, out_dir, samples, threads, progress, device)
+    _render_set(
+        geometry, views, shots, names, steps, times, out_dir, obstacles, samples, threads, progress, device
+    )
 
 
-def _render_set(geometry, views, shots, names, steps, times, out_dir, *options) -> None:
+def _render_set(geometry, views, shots, names, steps, times, out_dir, obstacles, *options) -> None:
     transforms = Path(out_dir, "transforms.json")
     transforms.unlink(missing_ok=True)  # marks the folder as unfinished
-    render_images(geometry, views, shots, out_dir, names, *options)
+    render_images(geometry, views, shots, out_dir, names, *options, obstacles=obstacles)
+    masks = (np.asarray(Image.open(Path(out_dir, name)))[..., 3] for name in names if obstacles)
+    visible = [bool((mask > 127).any()) for mask in masks] or [True] * len(names)
+    if not any(visible):
+        raise InputError("colliders", "hide the body in all images", "Move them, or give the scene images")
     frames = [
         {
             "file_path": name,
@@ -253,7 +296,8 @@ def _render_set(geometry, views, shots, names, steps, times, out_dir, *options) 
             "step": int(steps[frame]),
             "time": round(times[frame], 9),
         }
-        for name, (frame, view) in zip(names, shots, strict=True)
+        for name, (frame, view), seen in zip(names, shots, visible, strict=True)
+        if seen
     ]
     lens = {"fl_x": views.focal, "fl_y": views.focal, "cx": views.width / 2, "cy": views.height / 2}
     write_transforms(transforms, {"w": views.width, "h": views.height, **lens}, frames)

@@ -64,14 +64,20 @@ def main(path: str) -> None:
 
     folder = Path(path).parent
     cycles.start(*(int(s) for s in job["size"]), int(job["samples"]), threads, str(job["device"]))
-    body = cycles.Body(job)
+    body, matte = cycles.Body(job), bool(job["matte"])
+    obstacles = cycles.Obstacles(job, shadows=not matte)
     camera = cycles.add_camera(float(job["focal"]), int(job["size"][0]))
     current = None
     for index, (frame, view) in enumerate(job["shots"]):
         if frame != current:
             body.show(int(frame))
+            obstacles.show(int(frame))
             current = frame
         cycles.place(camera, job["c2w"][view])
+        if matte and obstacles.objects:
+            obstacles.cut_out(False)
+            cycles.render(folder / f"{index:05d}_all.png")
+            obstacles.cut_out(True)
         cycles.render(folder / f"{index:05d}.png")
         print(index + 1, file=report, flush=True)
     for lock in claimed:

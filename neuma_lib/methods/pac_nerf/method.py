@@ -74,11 +74,11 @@ class PacNerf(Method):
 
         from neuma_lib.io.files import read_json, write_json
         from neuma_lib.io.images import load_videos
+        from neuma_lib.io.simulator import simulator
         from neuma_lib.methods.pac_nerf.carried_field import CarriedField
         from neuma_lib.methods.pac_nerf.families import choose_family
         from neuma_lib.methods.pac_nerf.fit import fit_pac_nerf
         from neuma_lib.methods.pac_nerf.io import load_field
-        from neuma_lib.sim.model import MPM
 
         options = dict(options)
         prior, radiance = options.pop("prior"), options.pop("radiance")
@@ -104,7 +104,7 @@ class PacNerf(Method):
                 "Choose one view by +views=0, and ignore motion blur by dataset.exposure_samples: 1",
             )
         fit = fit_pac_nerf(
-            MPM(**problem.simulation),
+            simulator(problem.simulation),
             body,
             video.to(torch.float32, run.device),
             estimated["frames"][-1],

@@ -57,12 +57,12 @@ class SpringGaus(Method):
         from neuma_lib.io.files import write_json
         from neuma_lib.io.images import load_videos
         from neuma_lib.io.particles import load_reconstruction, with_motion
+        from neuma_lib.io.simulator import simulator
         from neuma_lib.methods.spring_gaus.body import SpringBody
         from neuma_lib.methods.spring_gaus.fit import fit_springs
         from neuma_lib.methods.spring_gaus.io import save_springs
         from neuma_lib.methods.spring_gaus.network import Springs
         from neuma_lib.methods.spring_gaus.rollout import SpringModel
-        from neuma_lib.sim.model import MPM
 
         settings = SpringGausOptions(**options)
         files = (inputs[name] for name in ("particles", "binding", "gaussians"))
@@ -72,7 +72,7 @@ class SpringGaus(Method):
         videos = [video.to(torch.float32, run.device) for video in videos]
         start, density = with_motion(body, inputs["velocity"]), float(body.mass.sum() / body.vol0.sum())
         loss = PixelLoss(body, videos, settings.covariance_gradient, compare=settings.compare)
-        check_contact(MPM(**problem.simulation), [(start, loss.frames)])
+        check_contact(simulator(problem.simulation), [(start, loss.frames)])
         anchored = SpringBody.of(body.x0, *(getattr(settings, name) for name in OF_NETWORK))
         springs = Springs.of_modulus(
             anchored.network, settings.guess, density, settings.resistance, settings.gap
@@ -84,7 +84,7 @@ class SpringGaus(Method):
         }
         checkpoint = run.checkpoint({**known, **options}, inputs)
         fitted = fit_springs(
-            SpringModel.of(MPM(**problem.simulation), settings.substeps),
+            SpringModel.of(simulator(problem.simulation), settings.substeps),
             anchored,
             springs,
             start,

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from neuma_lib.device import warp_stream
-from neuma_lib.errors import NonFiniteError
+from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.methods.spring_gaus.kernels import kernels, warp_types
 from neuma_lib.methods.spring_gaus.network import SpringNetwork, Springs
 from neuma_lib.sim.model import MPM
@@ -41,6 +41,10 @@ class SpringModel:
     @classmethod
     def of(cls, model: MPM, substeps: int = 1) -> SpringModel:
         """Gravity, time step and box of an MPM model, with planes where bodies come to rest in it."""
+        if model.colliders:
+            raise InputError(
+                "spring_gaus", "springs touch only the faces of the cube", "Leave this method out"
+            )
         low, high = model.free_range  # half a cell before the walls
         half = 0.5 * model.dx
         return cls(model.dt, model.gravity, low - half, high + half, substeps)

@@ -18,8 +18,8 @@ from neuma_lib.evaluation.plotting import rendering, style
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.laws import load_law
 from neuma_lib.io.particles import with_motion
+from neuma_lib.io.simulator import simulator
 from neuma_lib.paper.image_grid import GAP, ImageGrid, draw_images, note, place
-from neuma_lib.sim.model import MPM
 from neuma_lib.sim.prediction import predict
 
 LEFT, LEGEND, TITLE, PICTURES, CURVES, BETWEEN = 0.5, 0.2, 0.34, 4.0, 1.85, 0.38
@@ -36,7 +36,7 @@ def data(inputs, params, log) -> ImageGrid:
     blocks, rows, scenes = [], [], {}
     inside = [k for k, weight in enumerate(params.weights) if 0 <= weight <= 1]
     for k, (scene, setting) in enumerate(params.scenes.items()):
-        model = MPM(**setting["simulation"])
+        model = simulator(setting["simulation"])
         video, body, cameras = rendering.film(inputs, params, k, setting["density"])
         body, cameras = body.to(torch.float32, device), cameras.to(device)
         law = load_law(inputs.prior[k] if inputs.prior else None, inputs.adaptor[k], model.dt).to(device)

@@ -1,0 +1,107 @@
+"""Settings of obstacles in a scene, as the arguments of `neuma_lib.sim.colliders`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+from pydantic import Field, model_validator
+
+from neuma_lib.config.base import Section, Vector
+from neuma_lib.config.validation import hint
+from neuma_lib.errors import InputError
+
+MESH_SUFFIXES = (".obj", ".ply", ".stl", ".glb")
+LENGTHS = {
+    "plane": (),
+    "box": ("half width", "half height", "half depth"),
+    "sphere": ("radius",),
+    "capsule": ("half length", "radius"),
+}
+"""Lengths that describe each shape, as of `neuma_lib.sim.colliders`, which settings do not import."""
+UP = (0.0, 1.0, 0.0)
+
+
+def is_mesh_file(shape: str | None) -> bool:
+    """Whether a shape is the path of a mesh, and not the name of a built-in shape."""
+    return shape is not None and shape.lower().endswith(MESH_SUFFIXES)
+
+
+class ColliderConfig(Section):
+    """A rigid obstacle, in addition to the faces of the cube.
+
+    Its size [m] is: none for a plane, which fills the space below; half width, height and depth of a box; radius of a
+    sphere; half the length without the ends, and radius of a capsule; longest side of a mesh.
+    """
+
+    shape: str = Field(
+        description="plane, box, sphere, capsule, or the path of a closed mesh (.obj, .ply, .stl, .glb)"
+    )
+    size: tuple[float, ...] = Field((), description="lengths of the shape [m], see above")
+    centre: Vector = Field(
+        (0.0, 0.0, 0.0), description="centre, or a point of a plane [m]; of a mesh that of its bounding box"
+    )
+    axis: Vector = Field(
+        UP, description="direction of the shape's y axis: the normal of a plane, the axis of a capsule"
+    )
+    rotation: Vector = Field((0.0, 0.0, 0.0), description="rotation vector, in place of axis [rad]")
+    friction: float | None = Field(None, ge=0, description="Coulomb coefficient; null: bodies stick")
+    damping: float = Field(
+        0.0, ge=0, le=1, description="part of the approaching velocity that contact removes; 0: elastic"
+    )
+    velocity: Vector = Field((0.0, 0.0, 0.0), description="velocity of the centre [m/s]")
+    spin: Vector = Field((0.0, 0.0, 0.0), description="angular velocity about the centre [rad/s]")
+    keyframes: tuple[tuple[float, Vector, Vector], ...] = Field(
+        (),
+        description="poses in place of centre, rotation, velocity and spin: time [s], centre [m] and rotation vector "
+        "[rad] of each",
+    )
+
+    @model_validator(mode="after")
+    def _shape_is_whole(self) -> ColliderConfig:
+        if is_mesh_file(self.shape):
+            lengths: Sequence[str] = ("longest side",)
+        elif self.shape in LENGTHS:
+            lengths = LENGTHS[self.shape]
+        else:
+            known = [*LENGTHS, "a file.obj"]
+            raise InputError("shape", f"{self.shape!r} is unknown{hint(self.shape, known)}")
+        if len(self.size) != len(lengths) or not all(length > 0 for length in self.size):
+            wanted = f"[{', '.join(lengths)}], positive lengths in metres" if lengths else "left out"
+            raise InputError("size", f"{list(self.size)} of a {self.shape} must be {wanted}")
+        if not any(self.axis):
+            raise InputError("axis", "[0, 0, 0] is no direction", "Give for example [0, 1, 0]")
+        if any(self.rotation) and self.axis != UP:
+            raise InputError("axis", "a rotation is given, too", "Give one of the two")
+        times = [time for time, _, _ in self.keyframes]
+        if any(after <= before for before, after in pairwise(times)):
+            raise InputError("keyframes", f"times {times} s must ascend")
+        placed = (*self.centre, *self.rotation, *self.velocity, *self.spin)
+        if times and (self.axis != UP or any(placed)):
+            problem = "exclude centre, axis, rotation, velocity and spin"
+            raise InputError("keyframes", problem, "Leave those out")
+        return self
+
+    @property
+    def start(self) -> tuple[Vector, Vector]:
+        """Centre [m] and rotation vector [rad] at t = 0, or in the first key frame."""
+        if self.keyframes:
+            return self.keyframes[0][1:]
+        return self.centre, self.rotation if self.axis == UP else turned_up(self.axis)
+
+    def arguments(self) -> dict[str, Any]:
+        """Arguments of a collider, which JSON can hold. Those at their defaults are left out."""
+        given = self.model_dump(mode="json", exclude_defaults=True, exclude={"axis"})
+        return given | ({"rotation": list(self.start[1])} if self.axis != UP else {})
+
+
+def turned_up(axis: Sequence[float]) -> Vector:
+    """The shortest rotation vector [rad] from the y axis to a direction."""
+    x, y, z = (component / math.hypot(*axis) for component in axis)
+    sine = math.hypot(x, z)
+    if sine < 1e-12:  # any axis in the plane turns y to -y
+        return (0.0 if y > 0 else math.pi), 0.0, 0.0
+    angle = math.atan2(sine, y)
+    return angle * z / sine, 0.0, -angle * x / sine

@@ -1,0 +1,48 @@
+"""The simulator from its settings, whose colliders are plain and may name the files of meshes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from neuma_lib.config.obstacles import is_mesh_file
+from neuma_lib.errors import InputError
+from neuma_lib.geometry.mesh_collider import mesh_collider
+from neuma_lib.io.mesh_files import read_any_mesh
+from neuma_lib.sim.colliders import Collider
+from neuma_lib.sim.model import MPM
+
+
+def simulator(constants: Mapping[str, Any]) -> MPM:
+    """The simulator of the parameters of a stage. Arguments and errors as for `with_obstacles`."""
+    return MPM(**with_obstacles(constants))
+
+
+def with_obstacles(constants: Mapping[str, Any]) -> dict[str, Any]:
+    """Arguments of `MPM` with colliders in place of their settings (`ColliderConfig.arguments`).
+
+    Raises:
+        InputError: a value of a collider is wrong, or the file of a mesh cannot be read. It names the collider.
+    """
+    colliders = []
+    for k, settings in enumerate(constants.get("colliders", ())):
+        try:
+            colliders.append(_collider(settings))
+        except InputError as error:
+            where = f"colliders.{k}.{error.where.removeprefix('collider.')}"
+            raise InputError(where, error.problem, error.remedy) from None
+    return {**constants, **({"colliders": tuple(colliders)} if colliders else {})}
+
+
+def _collider(settings: Mapping[str, Any]) -> Collider:
+    if not is_mesh_file(settings["shape"]):
+        return Collider(**settings)
+    mesh = read_any_mesh(settings["shape"])
+    mesh.merge_vertices()  # some formats store the corners of each triangle
+    (longest,) = settings["size"]
+    scale = longest / float(mesh.extents.max())
+    mesh.vertices = scale * (mesh.vertices - np.mean(mesh.bounds, axis=0))
+    options = {key: value for key, value in settings.items() if key not in ("shape", "size")}
+    return mesh_collider(mesh, **options)
