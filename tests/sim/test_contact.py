@@ -275,9 +275,9 @@ def test_wrong_colliders_are_refused(settings, where):
 
 def test_wrong_models_are_refused():
     with refused("colliders"):
-        MPM(16, DT, colliders=(SHAPES["box"],))
+        MPM(16, DT, contact="nodes", colliders=(SHAPES["box"],))
     with refused("boundary"):
-        MPM(16, DT, contact="particles", boundary="sticky")
+        MPM(16, DT, boundary="sticky")
     with refused("collider.normal"):
         Collider.plane((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     assert set(SIZES) == set(SHAPES)
