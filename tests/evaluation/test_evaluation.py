@@ -112,7 +112,7 @@ class FailsOnce(Elasticity):
         return LAW.elasticity.response(F, weights) * (math.nan if self.count == self.step else 1)
 
 
-ON_THE_FLOOR = RADIUS + MODEL.free_range[0] - MODEL.dx / 2
+ON_THE_FLOOR = RADIUS - 0.01
 """Height at which particles of the ball feel the floor from the first step on."""
 
 

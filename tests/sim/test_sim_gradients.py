@@ -18,7 +18,9 @@ pytestmark = pytest.mark.core
 
 IN_THE_AIR = MPM(14, DT)
 ON_A_FLOOR = MPM(14, DT)
-ON_A_STICKY_FLOOR = MPM(14, DT, boundary={"y_min": "sticky"}, contact="nodes")  # stops its nodes always: no switch
+ON_A_STICKY_FLOOR = MPM(
+    14, DT, boundary={"y_min": "sticky"}, contact="nodes"
+)  # stops its nodes always: no switch
 ON_A_RELEASED_FLOOR = MPM(14, DT, boundary={"y_min": "sticky"}, contact="released")
 TOUCHING = 0.12
 """Height [m] at which the cube of `scene` is in the floor."""

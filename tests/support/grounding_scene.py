@@ -19,7 +19,7 @@ PRIOR = {"elasticity": {"name": "fixed_corotated", "E": 1e5, "nu": 0.2}, "plasti
 RADIUS = 0.13
 
 
-def ball(height: float = 0.3, count: int = 300, n_gaussians: int = 120, seed: int = 0, dtype=torch.float64):
+def ball(height: float = 0.28, count: int = 300, n_gaussians: int = 120, seed: int = 0, dtype=torch.float64):
     """A ball of particles with coloured Gaussians on and in it."""
     g = torch.Generator().manual_seed(seed)
 

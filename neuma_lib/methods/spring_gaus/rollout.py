@@ -41,8 +41,10 @@ class SpringModel:
     @classmethod
     def of(cls, model: MPM, substeps: int = 1) -> SpringModel:
         """Gravity, time step and box of an MPM model, with planes where bodies come to rest in it."""
-        low, high = model.free_range  # half a cell before the walls
-        half = 0.5 * model.dx
+        low, high = model.free_range
+        half = (
+            0.5 * model.dx if model.wall_nodes else 0.0
+        )  # contact of nodes starts half a cell before the wall
         return cls(model.dt, model.gravity, low - half, high + half, substeps)
 
 
