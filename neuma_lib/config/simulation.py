@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, model_validator
 
 from neuma_lib.config.base import Section, Vector
 
@@ -33,10 +33,19 @@ class SimulationConfig(Section):
     grid: int = Field(24, ge=8, description="grid cells along each side of the unit cube")
     gravity: Vector = Field((0.0, -9.8, 0.0), description="acceleration [m/s^2]")
     boundary: Annotated[str | dict[str, str], AfterValidator(_conditions)] = Field(
-        "no_slip", description="condition of all walls, no_slip, slip or sticky, or of each wall (x_min, ...)"
+        "no_slip",
+        description="condition of all walls, no_slip, slip or sticky (contact of nodes), or of "
+        "each wall (x_min, ...)",
     )
     contact: Literal["particles", "nodes", "released"] = Field(
         "particles",
         description="contact of particles with the faces of the cube; wall nodes outside the cube, so that bodies rest "
         "near y = 0; or wall nodes inside, with clamped particles, as in the authors' released code",
     )
+
+    @model_validator(mode="after")
+    def _only_nodes_are_sticky(self) -> SimulationConfig:
+        named = self.boundary if isinstance(self.boundary, dict) else {WALLS[0]: self.boundary}
+        if self.contact == "particles" and "sticky" in named.values():
+            raise ValueError("boundary: sticky needs contact: nodes, or use no_slip")
+        return self

@@ -96,6 +96,8 @@ MISTAKES = [
     ({"extensions": ["os"]}, "extensions"),
     ({"scenes": {"New": {"like": ["BouncyBall"]}}}, "scenes.New.like"),
     ({"simulation": {"boundary": "no_slp"}}, "simulation.boundary"),
+    ({"simulation": {"boundary": "sticky"}}, "simulation"),
+    ({"simulation": {"boundary": {"x_min": "sticky"}}}, "simulation"),
     ({"simulation": {"boundary": {"x_mn": "slip"}}}, "simulation.boundary"),
     ({"scenes": {"BouncyBall": {"appearance": {"accent": "red"}}}}, "scenes.BouncyBall.appearance.accent"),
     ({"random": {"count": 1_000_000}}, "random.count"),
