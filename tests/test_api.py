@@ -15,7 +15,7 @@ from neuma_lib.fitting.families import FAMILIES
 from neuma_lib.io.images import write_transforms
 from neuma_lib.mechanics.neural import neural_law
 from tests.support.errors import refused
-from tests.support.grounding_scene import MODEL, ball, camera, observe
+from tests.support.grounding_scene import HEIGHT, MODEL, ball, camera, observe
 from tests.support.viewer_project import STEPS, make_project
 
 pytestmark = pytest.mark.core
@@ -27,7 +27,7 @@ FRAMES = tuple(range(0, 121, 8))
 
 
 def moving(v0=V0) -> nm.InitialMotion:
-    return nm.InitialMotion(np.array(v0), np.zeros(3), np.array([0.5, 0.28, 0.5]), np.eye(3), np.zeros(6))
+    return nm.InitialMotion(np.array(v0), np.zeros(3), np.array([0.5, HEIGHT, 0.5]), np.eye(3), np.zeros(6))
 
 
 @pytest.fixture(scope="module")
