@@ -26,8 +26,8 @@ class SimulationConfig(Section):
     contact: Literal["particles", "nodes", "released"] = Field(
         "particles",
         description="contact of particles with the faces of the cube; wall nodes outside the cube, so that bodies rest "
-        "near y = 0; or wall nodes inside, with clamped particles, as in the authors' released code. Scenes with colliders have contact of "
-        "particles",
+        "near y = 0; or wall nodes inside, with clamped particles, as in the authors' released code. Scenes "
+        "with colliders have contact of particles",
     )
     boundary: str | float | dict[str, str | float] = Field(
         "no_slip",

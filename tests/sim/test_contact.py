@@ -248,12 +248,12 @@ def test_walls_and_colliders_have_coefficients_of_their_own_or_one_in_common():
     assert [each.friction for each in others.obstacles] == [0.7 if mu == math.inf else mu for mu in own]
     assert model.with_friction(math.inf) == model.with_friction(0.7).with_friction(math.inf)
     with refused("friction"):
-        MPM(16, DT).with_friction(0.3)
+        MPM(16, DT, contact="nodes").with_friction(0.3)
 
 
 def test_wrong_models_are_refused():
     with refused("colliders"):
-        MPM(16, DT, colliders=(SHAPES["box"],))
+        MPM(16, DT, contact="nodes", colliders=(SHAPES["box"],))
     for boundary in ("sticky", -0.1, math.nan, True, None, {"y_min": "0.3"}):
         with refused("boundary"):
             MPM(16, DT, contact="particles", boundary=boundary)

@@ -17,9 +17,13 @@ MODEL = MPM(grid=16, dt=2e-3)
 TRUTH = {"elasticity": {"name": "fixed_corotated", "E": 3e4, "nu": 0.3}, "plasticity": {"name": "identity"}}
 PRIOR = {"elasticity": {"name": "fixed_corotated", "E": 1e5, "nu": 0.2}, "plasticity": {"name": "identity"}}
 RADIUS = 0.13
+HEIGHT = 0.28
+"""Of the centre of the ball at the start [m]."""
 
 
-def ball(height: float = 0.3, count: int = 300, n_gaussians: int = 120, seed: int = 0, dtype=torch.float64):
+def ball(
+    height: float = HEIGHT, count: int = 300, n_gaussians: int = 120, seed: int = 0, dtype=torch.float64
+):
     """A ball of particles with coloured Gaussians on and in it."""
     g = torch.Generator().manual_seed(seed)
 
