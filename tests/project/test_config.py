@@ -101,8 +101,8 @@ MISTAKES = [
     ({"extensions": ["os"]}, "extensions"),
     ({"scenes": {"New": {"like": ["BouncyBall"]}}}, "scenes.New.like"),
     ({"simulation": {"boundary": "no_slp"}}, "simulation.boundary"),
-    ({"simulation": {"boundary": "sticky"}}, "simulation"),
-    ({"simulation": {"boundary": {"x_min": "sticky"}}}, "simulation"),
+    ({"simulation": {"boundary": "sticky"}}, "simulation.boundary"),
+    ({"simulation": {"boundary": {"x_min": "sticky"}}}, "simulation.boundary"),
     ({"simulation": {"boundary": {"x_mn": "slip"}}}, "simulation.boundary"),
     *[
         ({"simulation": {"contact": contact, "boundary": boundary}}, "simulation.boundary")
