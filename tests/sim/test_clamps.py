@@ -192,7 +192,7 @@ def test_a_column_hangs_by_its_weight(grid, offset):
     """A column of length L stretches by rho g L^2 / (2 E), and stays at rest when it is settled.
 
     The tip layer at the distance y from the clamp moves by rho g (L y - y^2 / 2) / E. A clamp acts as if it ended up to
-    0.7 cells dx higher or lower, which changes that by rho g L / E times 0.7 dx. The strain is at most rho g L / E, 2 %,
+    0.7 cells dx higher or lower, which changes that by rho g L / E times 0.7 dx. Strains are at most rho g L / E, 2 %,
     so that the law, which is not linear, changes it by 2 % at most.
     """
     E, L, width, spacing = 2e5, 0.4, 0.1, 0.02
