@@ -27,6 +27,7 @@ CLAMPS = {
     "resting": (LEFT,),
     "moving": (replace(LEFT, **MOTION),),
     "released": (replace(LEFT, **MOTION, release=0.015),),
+    "walls": (replace(LEFT, **MOTION, release=0.02),),
     "two": (replace(LEFT, keyframes=KEYFRAMES, release=0.03), Clamp((0.58, 0.0, 0.0), (1.0, 1.0, 1.0))),
 }
 
@@ -34,7 +35,8 @@ CLAMPS = {
 def clamped_cube(name, count=60, **options):
     """A model with clamps and a floor, and a strained cube that moves and touches the floor."""
     floor = Collider.plane((0.0, 0.36, 0.0), (0.0, 1.0, 0.0), friction=0.3)
-    model = MPM(14, DT, contact="particles", colliders=(floor,), clamps=CLAMPS[name], **options)
+    contact = {} if name == "walls" else {"contact": "particles", "colliders": (floor,)}
+    model = MPM(14, DT, clamps=CLAMPS[name], **contact, **options)
     x, mass, vol0 = cube(count)
     v, F, C = strained(x, size=0.02)
     return model, State(x, v, mass, vol0, F, C)
@@ -50,7 +52,7 @@ def loss_of(path):
 
 @pytest.mark.parametrize("name", CLAMPS)
 def test_equals_the_torch_twin(name):
-    """States and gradients of 40 steps, also if states are recomputed, and gradients of the constants of the law."""
+    """States and gradients of 40 steps, also if states are recomputed, and states in single precision."""
     model, start = clamped_cube(name)
     law = make_law("neo_hookean")
     results = []
@@ -69,6 +71,9 @@ def test_equals_the_torch_twin(name):
         torch.testing.assert_close(fast, slow, rtol=0, atol=1e-12)
         for a, b in zip(fast_grads, slow_grads, strict=True):
             assert (a - b).abs().max() < 1e-9 * b.abs().max()
+    single = State(*(getattr(start, key).float() for key in ("x", "v", "mass", "vol0", "F", "C")))
+    path = rollout(model, make_law("neo_hookean", torch.float32), single, steps=40, frames=(20, 40))
+    torch.testing.assert_close(path.x.double(), slow, rtol=0, atol=2e-5)
 
 
 @pytest.mark.parametrize("name", CLAMPS)
