@@ -175,11 +175,10 @@ class Workspace:
         """Set the obstacles at the steps of a segment that starts at step ``first`` of the simulation."""
         if self.size.n_poses > 1:
             times = [self.size.model.dt * (first + n) for n in range(steps)]
-            for target, source in (
-                (self.obstacles, self._obstacles(times)),
-                (self.holds, self._holds(times)),
-            ):
-                wp.copy(target, source, count=source.size)
+            with self.stream():
+                for target, values in ((self.obstacles, self._obstacles), (self.holds, self._holds)):
+                    source = values(times)
+                    wp.copy(target, source, count=source.size)
 
     def _obstacles(self, times: Sequence[float]) -> wp.array:
         """Colliders at some times [s]."""
