@@ -182,8 +182,8 @@ class Workspace:
         """Set the obstacles at the steps of a segment that starts at step ``first`` of the simulation."""
         if self.size.n_poses > 1:
             times = [self.size.model.dt * (first + n) for n in range(steps)]
-            self._load_obstacles(times)
-            if self.size.model.clamps:
+            with self.stream():
+                self._load_obstacles(times)
                 source = self._holds(times)
                 wp.copy(self.holds, source, count=source.size)
 

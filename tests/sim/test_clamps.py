@@ -27,6 +27,7 @@ CLAMPS = {
     "resting": (LEFT,),
     "moving": (replace(LEFT, **MOTION),),
     "released": (replace(LEFT, **MOTION, release=0.015),),
+    "walls": (replace(LEFT, **MOTION, release=0.02),),
     "two": (replace(LEFT, keyframes=KEYFRAMES, release=0.03), Clamp((0.58, 0.0, 0.0), (1.0, 1.0, 1.0))),
 }
 
@@ -34,7 +35,8 @@ CLAMPS = {
 def clamped_cube(name, count=60, **options):
     """A model with clamps and a floor, and a strained cube that moves and touches the floor."""
     floor = Collider.plane((0.0, 0.36, 0.0), (0.0, 1.0, 0.0), friction=0.3)
-    model = MPM(14, DT, contact="particles", colliders=(floor,), clamps=CLAMPS[name], **options)
+    contact = {} if name == "walls" else {"contact": "particles", "colliders": (floor,)}
+    model = MPM(14, DT, clamps=CLAMPS[name], **contact, **options)
     x, mass, vol0 = cube(count)
     v, F, C = strained(x, size=0.02)
     return model, State(x, v, mass, vol0, F, C)
@@ -50,7 +52,7 @@ def loss_of(path):
 
 @pytest.mark.parametrize("name", CLAMPS)
 def test_equals_the_torch_twin(name):
-    """States and gradients of 40 steps, also if states are recomputed, and gradients of the constants of the law."""
+    """States and gradients of 40 steps, also if states are recomputed, and states in single precision."""
     model, start = clamped_cube(name)
     law = make_law("neo_hookean")
     results = []
@@ -69,6 +71,9 @@ def test_equals_the_torch_twin(name):
         torch.testing.assert_close(fast, slow, rtol=0, atol=1e-12)
         for a, b in zip(fast_grads, slow_grads, strict=True):
             assert (a - b).abs().max() < 1e-9 * b.abs().max()
+    single = State(*(getattr(start, key).float() for key in ("x", "v", "mass", "vol0", "F", "C")))
+    path = rollout(model, make_law("neo_hookean", torch.float32), single, steps=40, frames=(20, 40))
+    torch.testing.assert_close(path.x.double(), slow, rtol=0, atol=2e-5)
 
 
 @pytest.mark.parametrize("name", CLAMPS)
@@ -102,7 +107,7 @@ def test_clamped_particles_follow_the_motion_exactly():
     clamp = replace(LEFT, keyframes=KEYFRAMES)
     model, start = clamped_cube("resting", count=400)
     model = replace(model, grid=32, clamps=(clamp,))
-    mine, inner = start.x[:, 0] <= 0.42, start.x[:, 0] < 0.42 - model.dx
+    mine, inner = start.x[:, 0] <= 0.42, start.x[:, 0] < 0.42 - 1.5 * model.dx
     path = rollout(
         model, make_law("hencky"), start, steps=30, frames=range(31), tracers=start.x[inner], total=True
     )
@@ -115,7 +120,7 @@ def test_clamped_particles_follow_the_motion_exactly():
         torch.testing.assert_close(path.tracers[n], placed[inner], rtol=0, atol=1e-13)
         for F in (path.F, path.F_total):
             torch.testing.assert_close(F[n, mine], turn @ start.F[mine], rtol=0, atol=1e-13)
-    assert inner.sum() > 20 and float((path.F[-1, ~mine] - start.F[~mine]).abs().max()) > 1e-3
+    assert inner.sum() > 15 and float((path.F[-1, ~mine] - start.F[~mine]).abs().max()) > 1e-3
 
 
 def test_a_release_is_smooth():
@@ -192,7 +197,7 @@ def test_a_column_hangs_by_its_weight(grid, offset):
     """A column of length L stretches by rho g L^2 / (2 E), and stays at rest when it is settled.
 
     The tip layer at the distance y from the clamp moves by rho g (L y - y^2 / 2) / E. A clamp acts as if it ended up to
-    0.7 cells dx higher or lower, which changes that by rho g L / E times 0.7 dx. The strain is at most rho g L / E = 2 %,
+    0.7 cells dx higher or lower, which changes that by rho g L / E times 0.7 dx. Strains are at most rho g L / E, 2 %,
     so that the law, which is not linear, changes it by 2 % at most.
     """
     E, L, width, spacing = 2e5, 0.4, 0.1, 0.02
@@ -221,8 +226,8 @@ def test_a_column_hangs_by_its_weight(grid, offset):
 def test_a_cantilever_bends_as_a_beam(grid, offset):
     """Deflection of Euler-Bernoulli with Timoshenko's shear, if the free length is L +- 0.7 dx (see `HELD_SHARE`).
 
-    The layer of particles at z has moved by rho g A z^2 (6 L^2 - 4 L z + z^2) / (24 E I) + rho g (L z - z^2 / 2) / (kappa G)
-    with I / A = h^2 / 12, G = E / 2 (nu = 0) and kappa = 5 / 6.
+    The particles at z move by rho g A z^2 (6 L^2 - 4 L z + z^2) / (24 E I) + rho g (L z - z^2 / 2) / (kappa G), with
+    I / A = h^2 / 12, G = E / 2 (nu = 0) and kappa = 5 / 6.
     """
     E, L, h, spacing = 1e7, 0.4, 0.1, 0.02
     end = round(0.3 * grid) / grid + offset / grid
