@@ -38,6 +38,6 @@ class SimulationConfig(Section):
     contact: Literal["particles", "nodes", "released"] = Field(
         "nodes",
         description="contact of particles with the faces of the cube; wall nodes outside the cube, so that bodies rest "
-        "near y = 0; or wall nodes inside, with clamped particles, as in the authors' released code. Scenes with colliders have contact of "
-        "particles",
+        "near y = 0; or wall nodes inside, with clamped particles, as in the authors' released code. Scenes with "
+        "colliders or clamps have contact of particles",
     )

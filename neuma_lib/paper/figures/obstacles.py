@@ -27,9 +27,9 @@ from neuma_lib.splatting.viewpoints import framing
 LEFT, TOP = 0.75, 0.05
 DIRECTION = np.array([0.35, 0.36, 1.0])
 """From the scene to the camera: so far above the floor that no horizon is in the frame."""
-FLOOR, FLOOR_REACH = (0.93, 0.93, 0.91), 5.0
+FLOOR, FLOOR_REACH = (0.93, 0.93, 0.91), 40.0
 """Colour of the floor, and half of its side [m], so that it fills the frame."""
-GLASS = 0.15
+GLASS = 0.08
 """Opacity of an obstacle around a body."""
 
 
