@@ -39,5 +39,5 @@ class SimulationConfig(Section):
         "nodes",
         description="contact of particles with the faces of the cube; wall nodes outside the cube, so that bodies rest "
         "near y = 0; or wall nodes inside, with clamped particles, as in the authors' released code. Scenes with "
-        "colliders or clamps have contact of particles",
+        "colliders have contact of particles",
     )

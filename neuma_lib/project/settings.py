@@ -159,7 +159,7 @@ class Config(Section):
         of = self.experiments.get(base) or self.scenes[base]
         lists = {"colliders": self.colliders(name)[1], "clamps": of.clamps}
         plain = {key: [each.arguments() for each in entries] for key, entries in lists.items() if entries}
-        return {"contact": "particles", **plain} if plain else {}
+        return plain | ({"contact": "particles"} if "colliders" in plain else {})
 
     def colliders(self, name: str) -> tuple[str, tuple[ColliderConfig, ...]]:
         """Path of the key with the colliders of a scene or an experiment, and them."""
