@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from neuma_lib.errors import InputError
-from neuma_lib.sim.state import cross_matrix
 
 Vector = tuple[float, float, float]
 AT_REST = {"velocity": (0.0, 0.0, 0.0), "spin": (0.0, 0.0, 0.0), "keyframes": ()}
@@ -148,7 +147,7 @@ class _Piece(NamedTuple):
 
 def turned(rotation: Tensor) -> Tensor:
     """Rotation matrix (3, 3) of a rotation vector (3,) [rad]."""
-    return torch.linalg.matrix_exp(cross_matrix(rotation))
+    return torch.from_numpy(Rotation.from_rotvec(rotation.numpy()).as_matrix())
 
 
 def rotation_vector(matrix: Tensor) -> Tensor:

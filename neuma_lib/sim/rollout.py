@@ -41,7 +41,7 @@ def rollout(
     tracers have no gradient.
 
     Args:
-        model: grid, time step, gravity and walls.
+        model: grid, time step, gravity, walls, colliders and clamps.
         law: law of all particles, or regions with their own laws.
         state: initial state of N particles.
         steps: number of time steps, not less than the last frame, at which the simulation ends.
@@ -50,8 +50,8 @@ def rollout(
         total: also compute the total deformation, F_total = (I + dt C) F_total without plastic return, initially F.
             Differentiable like F.
         skip_free_flight: compute the steps before the first contact in closed form if the state is undeformed and
-            has a uniform velocity, equal to simulated steps to round-off in value and gradient. Not used if a gradient
-            is required of v of shape (N, 3), F or C.
+            has a uniform velocity, equal to simulated steps to round-off in value and gradient. Not used with clamps
+            or if a gradient is required of v of shape (N, 3), F or C.
         memory: maximum bytes kept for the gradient, None for no limit. If it is less than the states of all steps
             need, these are recomputed segment by segment, with the same gradient.
         cache_bytes: maximum bytes for stresses, grids and caches of the laws, None for

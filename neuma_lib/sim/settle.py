@@ -30,8 +30,8 @@ def settle(
     """The state of rest under gravity, with colliders and clamps in their poses at t = 0.
 
     Gravity increases in equal stages. Velocities are set to zero whenever the kinetic energy has passed a maximum,
-    where the dominant vibration passes its equilibrium (kinetic damping, Cundall 1976). A stage ends at the first maximum,
-    the last one when all speeds have stayed below the tolerance for a time without damping.
+    where the dominant vibration passes its equilibrium (kinetic damping, Cundall 1976). A stage ends at the first
+    maximum, the last one when all speeds have stayed below the tolerance for a time without damping.
 
     Args:
         model, law, state: as in `simulate`. Velocities of the state are not used.
