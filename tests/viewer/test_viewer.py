@@ -262,13 +262,13 @@ def test_names_are_escaped(scene):
 def test_the_file_has_obstacles_with_their_poses(scene):
     """Triangles in the frame of the obstacle within half a quantisation step, and one pose a frame if it moves."""
     moving = Collider("box", (0.1, 0.2, 0.3), (0.5, 0.2, 0.5), spin=(0.0, 3.0, 0.0))
-    shown = replace(scene, colliders=(moving, Collider.plane((0, 0.1, 0), (0, 1, 0))))
-    times = [shown.dt * step for step in shown.steps]
+    crowded = replace(scene, colliders=(moving, Collider.plane((0, 0.1, 0), (0, 1, 0))))
+    times = [crowded.dt * step for step in crowded.steps]
     blob = Blob()
-    box, plane = (_obstacle(each, blob) for each in obstacles(shown.colliders, times))
+    box, plane = (_obstacle(each, blob) for each in obstacles(crowded.colliders, times))
     corners = decode(b"".join(blob.parts), box["corners"])[0].T
     (expected,) = obstacles([moving], times)
     np.testing.assert_allclose(corners, expected.vertices[expected.faces].reshape(-1, 3), atol=0.6 / 2**17)
     np.testing.assert_allclose(np.reshape(box["poses"], (-1, 3, 4)), expected.poses[:, :3], atol=1e-6)
     assert len(box["poses"]) == len(times) > 1 == len(plane["poses"])
-    assert '"obstacles":[{"corners"' in page(shown)
+    assert '"obstacles":[{"corners"' in page(crowded)
