@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import Field, model_validator
 
 from neuma_lib.config.base import Section, Vector
-from neuma_lib.config.obstacles import ColliderConfig
+from neuma_lib.config.obstacles import ClampConfig, ColliderConfig
 
 
 class BodyConfig(Section):
@@ -51,3 +51,4 @@ class ExperimentConfig(Section):
     colliders: tuple[ColliderConfig, ...] | None = Field(
         None, description="obstacles, as of a scene; null: those of the scene of the first body"
     )
+    clamps: tuple[ClampConfig, ...] = Field((), description="regions of the bodies that are held or moved")

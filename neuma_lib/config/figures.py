@@ -15,7 +15,7 @@ class FiguresConfig(Section):
     # Keys that name scenes or experiments.
     SHOWN: ClassVar[dict[str, str]] = {
         **dict.fromkeys(("main_res", "particles_app", "lora_alphav", "gradient_analysis"), "scene"),
-        **dict.fromkeys(("pipeline", "material_response"), "scene"),
+        **dict.fromkeys(("pipeline", "material_response", "obstacles"), "scene"),
         "i23d": "scene",
         **dict.fromkeys(("letters", "meetings", "ext_time"), "experiment"),
     }
@@ -68,6 +68,11 @@ class FiguresConfig(Section):
         ("BouncyBall", "JellyDuck", "RubberPawn", "ClayCat", "SandFish", "HoneyBottle"),
         min_length=1,
         description="scenes of the tests of material points",
+    )
+    obstacles: tuple[str, ...] = internal(
+        ("JellyStair", "ClayPress", "SandGlass"),
+        "scenes with colliders whose true motions are shown",
+        min_length=1,
     )
     shear_rate: float = internal(20.0, "shear rate of the yield test [1/s]", gt=0)
     total_shear: float = internal(0.6, "final shear of the yield test", gt=0)

@@ -22,6 +22,7 @@ LENGTHS = {
 }
 """Lengths that describe each shape, as of `neuma_lib.sim.colliders`, which settings do not import."""
 UP = (0.0, 1.0, 0.0)
+KeyFrames = tuple[tuple[float, Vector, Vector], ...]
 
 
 def is_mesh_file(shape: str | None) -> bool:
@@ -53,7 +54,7 @@ class ColliderConfig(Section):
     )
     velocity: Vector = Field((0.0, 0.0, 0.0), description="velocity of the centre [m/s]")
     spin: Vector = Field((0.0, 0.0, 0.0), description="angular velocity about the centre [rad/s]")
-    keyframes: tuple[tuple[float, Vector, Vector], ...] = Field(
+    keyframes: KeyFrames = Field(
         (),
         description="poses in place of centre, rotation, velocity and spin: time [s], centre [m] and rotation vector "
         "[rad] of each",
@@ -75,11 +76,9 @@ class ColliderConfig(Section):
             raise InputError("axis", "[0, 0, 0] is no direction", "Give for example [0, 1, 0]")
         if any(self.rotation) and self.axis != UP:
             raise InputError("axis", "a rotation is given, too", "Give one of the two")
-        times = [time for time, _, _ in self.keyframes]
-        if any(after <= before for before, after in pairwise(times)):
-            raise InputError("keyframes", f"times {times} s must ascend")
+        _check_times(self.keyframes)
         placed = (*self.centre, *self.rotation, *self.velocity, *self.spin)
-        if times and (self.axis != UP or any(placed)):
+        if self.keyframes and (self.axis != UP or any(placed)):
             problem = "exclude centre, axis, rotation, velocity and spin"
             raise InputError("keyframes", problem, "Leave those out")
         return self
@@ -95,6 +94,36 @@ class ColliderConfig(Section):
         """Arguments of a collider, which JSON can hold. Those at their defaults are left out."""
         given = self.model_dump(mode="json", exclude_defaults=True, exclude={"axis"})
         return given | ({"rotation": list(self.start[1])} if self.axis != UP else {})
+
+
+class ClampConfig(Section):
+    """A region of the body that follows a prescribed motion, or is held in place."""
+
+    lowest: Vector = Field(description="corner of the region at t = 0 [m]")
+    highest: Vector = Field(description="opposite corner, larger on every axis [m]")
+    release: float | None = Field(
+        None, gt=0, description="time from which on it moves freely [s]; null: never"
+    )
+    keyframes: KeyFrames = Field(
+        (), description="motion, as of a collider, from its first key frame on; [] holds it"
+    )
+
+    @model_validator(mode="after")
+    def _region_is_whole(self) -> ClampConfig:
+        if not all(low < high for low, high in zip(self.lowest, self.highest, strict=True)):
+            raise InputError("highest", f"{list(self.highest)} must exceed lowest on every axis")
+        _check_times(self.keyframes)
+        return self
+
+    def arguments(self) -> dict[str, Any]:
+        """Arguments of a clamp, which JSON can hold. Those at their defaults are left out."""
+        return self.model_dump(mode="json", exclude_defaults=True)
+
+
+def _check_times(keyframes: KeyFrames) -> None:
+    times = [time for time, _, _ in keyframes]
+    if any(after <= before for before, after in pairwise(times)):
+        raise InputError("keyframes", f"times {times} s must ascend")
 
 
 def turned_up(axis: Sequence[float]) -> Vector:

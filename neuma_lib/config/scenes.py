@@ -11,7 +11,7 @@ from neuma_lib.config.base import Section, Vector, internal
 from neuma_lib.config.blender import AppearanceConfig
 from neuma_lib.config.dataset import CONVERGED, TruthConfig
 from neuma_lib.config.laws import LawConfig
-from neuma_lib.config.obstacles import ColliderConfig
+from neuma_lib.config.obstacles import ClampConfig, ColliderConfig
 from neuma_lib.config.splats import SplatConfig
 
 
@@ -96,6 +96,7 @@ class SceneConfig(Section):
     colliders: tuple[ColliderConfig, ...] = Field(
         (), description="obstacles, in addition to the faces of the cube"
     )
+    clamps: tuple[ClampConfig, ...] = Field((), description="regions of the body that are held or moved")
     law: LawConfig | None = Field(description="the true material, used by the ground truth only")
     truth: TruthConfig = Field(TruthConfig(), description="resolution of the ground truth")
     dt: float = Field(gt=0, description="time step of the reconstruction, the unit of frames and steps [s]")

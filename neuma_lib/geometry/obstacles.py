@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 import trimesh
 from skimage.measure import marching_cubes
 
@@ -13,6 +14,8 @@ from neuma_lib.sim.colliders import Collider
 
 GREY = (0.49, 0.51, 0.54)
 """Colour of colliders, sRGB."""
+SIGHTS, SAMPLES = 300, 200
+"""Points of a body and points of each line of sight that are tested for obstacles."""
 PLANE_REACH = 0.75
 """Half the side of the square that stands for a plane [m]: the faces of the unit cube with a margin."""
 
@@ -55,6 +58,22 @@ def obstacles(colliders: Sequence[Collider], times: Sequence[float]) -> list[Obs
             pose[:3, :3], pose[:3, 3] = axes.numpy(), centre.numpy()
         result.append(Obstacle(np.asarray(mesh.vertices), np.asarray(mesh.faces), poses))
     return result
+
+
+def sees_all(colliders: Sequence[Collider], eyes: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Whether no collider is between an eye and the points of a body at t = 0, shape (E,).
+
+    Args:
+        eyes: shape (E, 3) [m].
+        points: shape (n, 3) [m], of which at most `SIGHTS` are used.
+    """
+    points = torch.from_numpy(np.asarray(points, float)[:: -(-len(points) // SIGHTS)])
+    share = torch.linspace(0, 1, SAMPLES, dtype=torch.float64)[:, None, None]
+    free = []
+    for eye in torch.from_numpy(np.asarray(eyes, float)):
+        x = eye + share * (points - eye)
+        free.append(all(bool((collider.surface(x)[0] >= 0).all()) for collider in colliders))
+    return np.array(free)
 
 
 def _surface(collider: Collider) -> trimesh.Trimesh:

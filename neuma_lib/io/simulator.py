@@ -1,4 +1,4 @@
-"""The simulator from its settings, whose colliders are plain and may name the files of meshes."""
+"""The simulator from its settings, whose colliders and clamps are plain and may name the files of meshes."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from neuma_lib.config.obstacles import is_mesh_file
 from neuma_lib.errors import InputError
 from neuma_lib.geometry.mesh_collider import mesh_collider
 from neuma_lib.io.mesh_files import read_any_mesh
+from neuma_lib.sim.clamps import Clamp
 from neuma_lib.sim.colliders import Collider
 from neuma_lib.sim.model import MPM
 
@@ -21,19 +22,22 @@ def simulator(constants: Mapping[str, Any]) -> MPM:
 
 
 def with_obstacles(constants: Mapping[str, Any]) -> dict[str, Any]:
-    """Arguments of `MPM` with colliders in place of their settings (`ColliderConfig.arguments`).
+    """Arguments of `MPM` with colliders and clamps in place of their settings (`ColliderConfig.arguments`).
 
     Raises:
-        InputError: a value of a collider is wrong, or the file of a mesh cannot be read. It names the collider.
+        InputError: a value is wrong, or the file of a mesh cannot be read. It names the entry.
     """
-    colliders = []
-    for k, settings in enumerate(constants.get("colliders", ())):
-        try:
-            colliders.append(_collider(settings))
-        except InputError as error:
-            where = f"colliders.{k}.{error.where.removeprefix('collider.')}"
-            raise InputError(where, error.problem, error.remedy) from None
-    return {**constants, **({"colliders": tuple(colliders)} if colliders else {})}
+    arguments = dict(constants)
+    for name, make in {"colliders": _collider, "clamps": lambda settings: Clamp(**settings)}.items():
+        made = []
+        for k, settings in enumerate(constants.get(name, ())):
+            try:
+                made.append(make(settings))
+            except InputError as error:
+                where = f"{name}.{k}.{error.where.removeprefix(f'{name[:-1]}.')}"
+                raise InputError(where, error.problem, error.remedy) from None
+        arguments |= {name: tuple(made)} if made else {}
+    return arguments
 
 
 def _collider(settings: Mapping[str, Any]) -> Collider:

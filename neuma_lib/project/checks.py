@@ -238,13 +238,10 @@ def _contains(collider: ColliderConfig, point: np.ndarray) -> bool:
 
 
 def _mesh_problems(where: str, colliders: Sequence[ColliderConfig]) -> Iterator[str]:
-    """Files of the meshes of colliders that cannot be read."""
+    """Files of the meshes of colliders that do not exist. They are read when the truth is simulated."""
     for k, collider in enumerate(colliders):
-        if is_mesh_file(collider.shape):
-            try:
-                _mesh_proportions(collider.shape)
-            except InputError as error:
-                yield f"{where}.{k}.shape: {error}"
+        if is_mesh_file(collider.shape) and not Path(collider.shape).is_file():
+            yield f"{where}.{k}.shape: no file {collider.shape}. Give its path relative to the project's folder"
 
 
 @cache

@@ -156,9 +156,11 @@ class Config(Section):
 
     def obstacles(self, name: str) -> dict[str, Any]:
         """Plain arguments of `neuma_lib.io.simulator.simulator` of a scene or an experiment with obstacles."""
-        _, colliders = self.colliders(name)
-        plain = [each.arguments() for each in colliders]
-        return {"contact": "particles", "colliders": plain} if plain else {}
+        base, _ = self.replicate(name)
+        of = self.experiments.get(base) or self.scenes[base]
+        lists = {"colliders": self.colliders(name)[1], "clamps": of.clamps}
+        plain = {key: [each.arguments() for each in entries] for key, entries in lists.items() if entries}
+        return plain | ({"contact": "particles"} if "colliders" in plain else {})
 
     def colliders(self, name: str) -> tuple[str, tuple[ColliderConfig, ...]]:
         """Path of the key with the colliders of a scene or an experiment, and them."""

@@ -108,6 +108,15 @@ class Motion:
         pose = {"centre": tuple(centre.tolist()), "rotation": tuple(rotation_vector(axes).tolist())}
         return replace(self, **pose, **AT_REST) if self.moves else self  # type: ignore[type-var]
 
+    def later(self, time: float) -> Self:
+        """The same object with t = 0 at a later time [s]."""
+        if self.keyframes:
+            frames = tuple((moment - time, *pose) for moment, *pose in self.keyframes)
+            return replace(self, keyframes=frames)  # type: ignore[type-var]
+        axes, centre = self.pose(time)
+        pose = {"centre": tuple(centre.tolist()), "rotation": tuple(rotation_vector(axes).tolist())}
+        return replace(self, **pose) if self.moves else self  # type: ignore[type-var]
+
     @cached_property
     def _pieces(self) -> tuple[_Piece, ...]:
         """Intervals of constant velocity and spin. The first also covers the time before it."""

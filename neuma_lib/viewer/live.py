@@ -124,7 +124,7 @@ class LiveSimulation:
     """Bodies in the box, simulated by a thread.
 
     Args:
-        constants: arguments of `MPM`; dt and gravity are ignored.
+        constants: arguments of `MPM`; dt, gravity and clamps are ignored.
         start: initial state of the first body, restored by a reset. The simulation runs on its device.
         law: of the first body, on the same device.
         dt: time step of the law's training [s].
@@ -135,7 +135,9 @@ class LiveSimulation:
     """
 
     def __init__(self, constants: Mapping[str, Any], start: State, law: Law, dt: float):
-        self._constants = {key: value for key, value in constants.items() if key not in ("dt", "gravity")}
+        self._constants = {
+            key: value for key, value in constants.items() if key not in ("dt", "gravity", "clamps")
+        }
         self._start, self._first_law, self._first_dt = start, law, dt
         self._strength, self.floor = EARTH, np.eye(3)
         self._weight = 1.0
@@ -281,7 +283,9 @@ class LiveSimulation:
     def model(self) -> MPM:
         """Model of the next steps, with the smallest time step of the laws' trainings."""
         gravity = self.to_box((0.0, -self._strength, 0.0))
-        return MPM(**self._constants, dt=min(self._dts), gravity=tuple(gravity.tolist()))
+        moved = tuple(each.later(self._time) for each in self._constants.get("colliders", ()))
+        constants = {**self._constants, "colliders": moved}
+        return MPM(**constants, dt=min(self._dts), gravity=tuple(gravity.tolist()))
 
     def _loop(self) -> None:
         due = time.perf_counter()

@@ -219,7 +219,7 @@ function farFirst(depths, count) {
 // ---- what is shown -------------------------------------------------------------------------------------------------
 
 let data, shEach, opacities;
-const motions = [], textures = new Map();
+const motions = [], obstacles = [], textures = new Map();
 const orbit = { target: [0.5, 0.2, 0.5], yaw: 0.45, pitch: 0.28, distance: 1.9 };
 const state = { frame: 0, playing: false, clock: 0, last: 0, dirty: true };
 
@@ -334,6 +334,20 @@ function boxLines() {
   return new Float32Array(rows);
 }
 
+function drawObstacles(camera) {
+  for (const { corners, poses, color } of obstacles) {
+    const m = poses[Math.min(state.frame, poses.length - 1)], rows = new Float32Array(7 * corners.length / 3);
+    const placed = (i) => [0, 1, 2].map((r) => m[4 * r] * corners[i] + m[4 * r + 1] * corners[i + 1] + m[4 * r + 2] * corners[i + 2] + m[4 * r + 3]);
+    for (let i = 0, at = 0; i < corners.length; i += 9) {
+      const [a, b, c] = [placed(i), placed(i + 3), placed(i + 6)], u = minus(b, a), v = minus(c, a);
+      const n = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]];
+      const light = 0.8 + 0.2 * (0.35 * n[0] + 0.8 * n[1] + 0.5 * n[2]) / (Math.hypot(...n) || 1);
+      for (const p of [a, b, c]) { rows.set([...p, ...color.map((part) => part * light), 1], at); at += 7; }
+    }
+    drawPlain("lines", camera, rows, [["mean", 3], ["colour", 4]], gl.TRIANGLES);
+  }
+}
+
 const DEPTH_OF_FRUSTUM = 0.16;
 
 function frustum(view) {
@@ -408,6 +422,7 @@ function drawPanel(motion, other, what, place) {
     drawPlain("lines", camera, boxLines(), [["mean", 3], ["colour", 4]], gl.LINES);
     gl.depthMask(true);
   }
+  drawObstacles(camera);
   if (byId("frusta").checked && chosen === "") drawFrusta(camera);
   if (what === "seen" || what === "distance") {
     if (motion.means) drawSplats(camera, motion, what === "distance" && other && other.means ? other : null);
@@ -587,6 +602,7 @@ async function main() {
       means: motion.means ? new Frames(data, motion.means) : null, roots: motion.roots ? new Frames(data, motion.roots) : null,
     });
   }
+  for (const each of meta.obstacles) obstacles.push({ ...each, corners: new Frames(data, each.corners).frame(0) });
   home();
   controls();
   changed();

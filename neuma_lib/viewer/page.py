@@ -21,6 +21,7 @@ from torch import Tensor
 
 from neuma_lib.errors import InputError
 from neuma_lib.extras import require
+from neuma_lib.geometry.obstacles import Obstacle, obstacles
 from neuma_lib.io.files import write_text
 from neuma_lib.viewer.scalars import QUANTITIES
 from neuma_lib.viewer.scene import Log, Motion, Scene, View, frame_at
@@ -149,6 +150,9 @@ def _filled(scene: Scene, steps: tuple[int, ...], particles: int, limits: list[s
         },
         "motions": [_motion(scene, motion, steps, particles, blob) for motion in scene.motions],
         "views": [_view(view, steps, blob) for view in scene.views],
+        "obstacles": [
+            _obstacle(each, blob) for each in obstacles(scene.colliders, [scene.dt * n for n in steps])
+        ],
         "quantities": {
             name: {
                 "label": quantity.label,
@@ -199,6 +203,17 @@ def _motion(scene: Scene, motion: Motion, steps: tuple[int, ...], particles: int
         content["means"] = blob.frames(motion.means[at].transpose(1, 2).numpy())
         content["roots"] = blob.frames(roots(motion.covars[at]))
     return content
+
+
+def _obstacle(obstacle: Obstacle, blob: Blob) -> dict:
+    """Corners of all triangles in its frame, and its poses in all frames, or one if it rests, row by row."""
+    corners = obstacle.vertices[obstacle.faces].reshape(-1, 3)
+    poses = obstacle.poses[:, :3] if obstacle.moves else obstacle.poses[:1, :3]
+    return {
+        "corners": blob.frames(corners.T[None]),
+        "poses": poses.reshape(-1, 12).round(6).tolist(),
+        "color": list(obstacle.color),
+    }
 
 
 def _view(view: View, steps: tuple[int, ...], blob: Blob) -> dict:

@@ -18,6 +18,7 @@ from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.geometry.shapes import place
 from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.io.particles import load_reconstruction, with_motion
+from neuma_lib.io.simulator import with_obstacles
 from neuma_lib.mechanics.law import Law
 from neuma_lib.methods.base import ModelSource
 from neuma_lib.project.files import SceneFiles, inside
@@ -80,12 +81,11 @@ class Playground:
         self._bodies, self._whole, self.names = [first], [first], [files.name]
         self._arms: dict[int, Tensor] = {}
         self._loaded: dict[str, Law] = {}
-        self._constants, self._start = dict(files.simulation), start.to(device)
+        self._constants, self._start = with_obstacles(files.simulation), start.to(device)
+        self._constants.pop("clamps", None)  # the user holds the body
         self._changing = threading.Lock()
         self.chosen = chosen
-        self.simulation = LiveSimulation(
-            files.simulation, self._start, self.law(chosen), self.laws[chosen].dt
-        )
+        self.simulation = LiveSimulation(self._constants, self._start, self.law(chosen), self.laws[chosen].dt)
 
     def law(self, name: str) -> Law:
         """A law by name, loaded on first use."""

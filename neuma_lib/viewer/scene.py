@@ -20,9 +20,11 @@ from neuma_lib.io.files import one_line, parse_json
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.images import read_image_set, read_transforms
 from neuma_lib.io.particles import load_reconstruction
+from neuma_lib.io.simulator import with_obstacles
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.law import Law
 from neuma_lib.project.files import RunFiles, SceneFiles
+from neuma_lib.sim.colliders import Collider
 from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.viewer import scalars
 
@@ -83,6 +85,7 @@ class Scene:
         views: cameras.
         ranges: legend ranges by name, see `scalars.ranges`.
         notes: messages on missing content.
+        colliders: obstacles.
     """
 
     name: str
@@ -93,6 +96,7 @@ class Scene:
     views: tuple[View, ...]
     ranges: dict[str, tuple[float, float]]
     notes: tuple[str, ...]
+    colliders: tuple[Collider, ...] = ()
 
     @property
     def steps(self) -> tuple[int, ...]:
@@ -147,7 +151,10 @@ def load_scene(
         except InputError as error:
             notes.append(f"no cameras: {one_line(error)}")
     bounds, volume = scalars.ranges(motion.scalars for motion in motions), float(body.vol0.sum())
-    return Scene(files.name, dt, body.gaussians, volume, tuple(motions), views, bounds, tuple(notes))
+    colliders = with_obstacles(files.simulation).get("colliders", ())
+    return Scene(
+        files.name, dt, body.gaussians, volume, tuple(motions), views, bounds, tuple(notes), colliders
+    )
 
 
 def true_motion(path: Path, body: Reconstruction, dt: float) -> Motion:

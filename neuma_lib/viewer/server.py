@@ -17,6 +17,7 @@ from trimesh.visual.texture import TextureVisuals
 
 from neuma_lib.errors import InputError
 from neuma_lib.extras import require
+from neuma_lib.geometry.obstacles import obstacles
 from neuma_lib.geometry.shapes import NAMES
 from neuma_lib.splatting.spherical_harmonics import sh0_to_rgb
 from neuma_lib.viewer.live import EARTH, MAX_SPEED, PIVOT, Snapshot
@@ -128,6 +129,12 @@ class ViewerServer:
                 f"/{name}/box/floor", width=1.0, height=1.0, plane="xz", cell_size=0.1, section_size=0.5,
                 position=(0.5, 0.0, 0.5), shadow_opacity=0.0,
             )  # fmt: skip
+            for k, each in enumerate(obstacles(self.scene.colliders, [0.0])):
+                color = tuple(round(255 * part) for part in each.color)
+                self._nodes[name, "obstacle", k] = scene.add_mesh_simple(
+                    f"/{name}/box/obstacle_{k}", each.vertices, each.faces, color=color, flat_shading=True
+                )
+        self._move_obstacles(0.0)
         self._nodes["right", "frame"] = scene.get_handle_by_name("/right")
         scene.add_frame("/axes", axes_length=_AXES, axes_radius=0.03 * _AXES)
         for name, place in (("x", (_AXES, 0, 0)), ("y (up)", (0, _AXES, 0)), ("z", (0, 0, _AXES))):
@@ -317,6 +324,7 @@ class ViewerServer:
         text = [f"**{1e3 * self.scene.dt * step:.0f} ms**"]
         self._turn(np.eye(3))
         with self.server.atomic():
+            self._move_obstacles(self.scene.dt * step)
             self._label_bodies(())
             pair = display == DISTANCE
             self._draw_motion("left", left, step, display, right, text)
@@ -368,6 +376,7 @@ class ViewerServer:
         self._nodes["right", "frame"].visible = False
         name = BY_QUANTITY.get(self.gui["show"].value)
         with self.server.atomic():
+            self._move_obstacles(snapshot.time)
             if name is None:
                 picture: Picture = play.picture(snapshot, self.gui["flow"].value)
                 rgb = sh0_to_rgb(picture.gaussians.sh0[:, 0]).clamp(0, 1).numpy()
@@ -414,6 +423,15 @@ class ViewerServer:
             gaps = (a.means - b.means[at]).norm(dim=-1)
             self._reach[a.name, b.name] = rounded_up(max(float(np.percentile(gaps, 99)), 1e-4))
         return self._reach[a.name, b.name]
+
+    def _move_obstacles(self, time: float) -> None:
+        """Set the poses of all colliders at a time [s]."""
+        for k, collider in enumerate(self.scene.colliders):
+            axes, centre = collider.pose(time)
+            for side in ("left", "right"):
+                node = self._nodes[side, "obstacle", k]
+                node.wxyz = self.viser.transforms.SO3.from_matrix(axes.numpy()).wxyz
+                node.position = centre.numpy()
 
     def _turn(self, floor: np.ndarray) -> None:
         box = self._nodes["left", "box"]

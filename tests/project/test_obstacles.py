@@ -12,6 +12,7 @@ from neuma_lib.config.obstacles import ColliderConfig
 from neuma_lib.io.simulator import simulator
 from neuma_lib.project import checks
 from neuma_lib.project.find import scene_files
+from neuma_lib.sim.clamps import Clamp
 from neuma_lib.sim.colliders import SIZES, Collider
 from tests.support.errors import refused
 
@@ -131,9 +132,32 @@ def test_problems_of_obstacles_are_named(with_colliders, tmp_path):
     experiments = {"x": {"title": "x", "bodies": [body], "steps": 10, "colliders": [STEP, around]}}
     missing = {"shape": "none.stl", "size": [0.1]}
     first, second, third = checks.problems(with_colliders(around, missing, experiments=experiments))
-    assert first.startswith("scenes.Steps.colliders.1.shape: none.stl")
+    assert first.startswith("scenes.Steps.colliders.1.shape: no file none.stl")
     assert second.startswith("scenes.Steps.colliders.0: the box contains")
     assert third.startswith("experiments.x.colliders.1: the box contains")
     file = tmp_path / "ball.stl"
-    trimesh.creation.icosphere(2).export(file)
+    ball = trimesh.creation.icosphere(3, radius=7.0).apply_translation([1, 2, 3])
+    ball.export(file)
     assert not checks.problems(with_colliders(STEP, {"shape": str(file), "size": [0.1]}))
+    mesh = {"shape": str(file), "size": [0.4], "centre": [0.5, 0.5, 0.5], "friction": 0.3}
+    (collider,) = simulator({"grid": 8, "dt": 1e-3, "contact": "particles", "colliders": [mesh]}).colliders
+    distance, _ = collider.surface(torch.tensor([[0.8, 0.5, 0.5], [0.5, 0.5, 0.4]], dtype=torch.float64))
+    # facets are up to 1 % of the radius inside the ball, and distances are those of a grid of 7 mm
+    np.testing.assert_allclose(distance, [0.1, -0.1], atol=0.004)
+    assert collider.friction == 0.3
+
+
+def test_clamps_are_those_of_the_simulator(changed):
+    clamp = {
+        "lowest": [0, 0.5, 0],
+        "highest": [1, 1, 1],
+        "release": 0.1,
+        "keyframes": [[0, [0, 0, 0], [0, 0, 0]]],
+    }
+    settings = changed(scenes={"Held": {"like": "BouncyBall", "clamps": [clamp, {**clamp, "release": None}]}})
+    first, second = simulator(scene_files(settings, "Held", []).simulation).clamps
+    assert first == Clamp((0, 0.5, 0), (1, 1, 1), 0.1, keyframes=((0, (0, 0, 0), (0, 0, 0)),))
+    assert second.release == np.inf
+    for wrong in ({"highest": [1, 0.5, 1]}, {"release": 0}, {"keyframes": 2 * clamp["keyframes"]}):
+        with refused(f"scenes.Held.clamps.0.{next(iter(wrong))}"):
+            changed(scenes={"Held": {"like": "BouncyBall", "clamps": [clamp | wrong]}})

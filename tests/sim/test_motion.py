@@ -40,6 +40,15 @@ def test_a_pose_between_key_frames_is_interpolated():
         np.testing.assert_allclose(centre, expected, atol=1e-15)
 
 
+@pytest.mark.parametrize("motion", [{"keyframes": KEYFRAMES}, {"velocity": (1, 2, 3), "spin": (0, 4, 5)}, {}])
+def test_a_later_motion_continues(motion):
+    collider = Collider("sphere", (0.1,), **motion)
+    later = collider.later(0.2)
+    for time in (0.0, 0.07, 0.3):
+        for own, expected in zip(later.pose(time), collider.pose(0.2 + time), strict=True):
+            torch.testing.assert_close(own, expected, rtol=0, atol=1e-12)
+
+
 @pytest.mark.parametrize("time", [0.05, 0.17, 0.28, 0.4])
 def test_the_velocity_is_the_change_of_the_pose(time):
     """A point that is fixed in the frame moves with `velocity_at`; `fastest` is an upper bound in the cube."""

@@ -28,8 +28,9 @@ np.savez(sys.argv[3], **parts)
 
 
 def read_blend(path, times):
-    """Vertices "co" (T, n, 3) of the object "body" at times [s], its matrix "world" (4, 4), and those of obstacles, "poses"
-    (K, T, 4, 4)."""
+    """Vertices "co" (T, n, 3) of the object "body" at times [s], its matrix "world" (4, 4), and those of obstacles,
+    "poses" (K, T, 4, 4).
+    """
     with tempfile.TemporaryDirectory() as folder:
         script, output = Path(folder, "read.py"), Path(folder, "read.npz")
         script.write_text(READ)

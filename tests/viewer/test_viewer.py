@@ -4,16 +4,19 @@ import json
 import re
 import zlib
 from base64 import b64decode
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
+from neuma_lib.geometry.obstacles import obstacles
 from neuma_lib.io.hdf5 import read_arrays, write_arrays
 from neuma_lib.project.files import SceneFiles, inside
 from neuma_lib.project.find import find_scene
+from neuma_lib.sim.colliders import Collider
 from neuma_lib.viewer import scalars
-from neuma_lib.viewer.page import Blob, page, quantised, roots
+from neuma_lib.viewer.page import Blob, _obstacle, page, quantised, roots
 from neuma_lib.viewer.scene import load_scene
 from tests.support.errors import refused
 from tests.support.sim_scenes import SPECS, make_law
@@ -254,3 +257,18 @@ def test_names_are_escaped(scene):
 
     text = page(replace(scene, name="</script><b>@DATA@", notes=("</script>",)))
     assert text.count("</script>") == 3 and "&lt;/script>" in text
+
+
+def test_the_file_has_obstacles_with_their_poses(scene):
+    """Triangles in the frame of the obstacle within half a quantisation step, and one pose a frame if it moves."""
+    moving = Collider("box", (0.1, 0.2, 0.3), (0.5, 0.2, 0.5), spin=(0.0, 3.0, 0.0))
+    crowded = replace(scene, colliders=(moving, Collider.plane((0, 0.1, 0), (0, 1, 0))))
+    times = [crowded.dt * step for step in crowded.steps]
+    blob = Blob()
+    box, plane = (_obstacle(each, blob) for each in obstacles(crowded.colliders, times))
+    corners = decode(b"".join(blob.parts), box["corners"])[0].T
+    (expected,) = obstacles([moving], times)
+    np.testing.assert_allclose(corners, expected.vertices[expected.faces].reshape(-1, 3), atol=0.6 / 2**17)
+    np.testing.assert_allclose(np.reshape(box["poses"], (-1, 3, 4)), expected.poses[:, :3], atol=1e-6)
+    assert len(box["poses"]) == len(times) > 1 == len(plane["poses"])
+    assert '"obstacles":[{"corners"' in page(crowded)

@@ -9,6 +9,7 @@ import torch
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.law import Elasticity, Law
 from neuma_lib.mechanics.neural import neural_law
+from neuma_lib.sim.colliders import Collider
 from neuma_lib.sim.model import MPM
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
@@ -28,8 +29,8 @@ def start(height=0.3, count=200, velocity=(0.0, 0.0, 0.0)):
 def live():
     opened = []
 
-    def make(law=None, paused=False, **options):
-        live = LiveSimulation(CONSTANTS, start(**options), law or make_law("hencky", torch.float32), DT)
+    def make(law=None, paused=False, constants=CONSTANTS, **options):
+        live = LiveSimulation(constants, start(**options), law or make_law("hencky", torch.float32), DT)
         live.run(not paused)
         opened.append(live.open())
         return live
@@ -71,6 +72,23 @@ def test_it_simulates_what_a_rollout_does(live):
     assert torch.allclose(live_x, wanted.x[0], atol=2e-4)
     assert torch.allclose(result.total, wanted.F_total[0], atol=5e-3)
     assert (result.F - torch.eye(3)).abs().max() > 1e-3, "it has touched the floor"
+
+
+def test_colliders_move_on_from_frame_to_frame(live):
+    """A lift rises through the body, and lifts it as in one rollout."""
+    lift = Collider(
+        "box", (0.4, 0.02, 0.4), (0.5, 0.05, 0.5), velocity=(0.0, 1.0, 0.0), spin=(0.0, 1.0, 0.0)
+    )
+    constants = {"grid": 16, "contact": "particles", "colliders": (lift,)}
+    result = reached(live(constants=constants), lambda s: s.time > 0.2)
+    steps = round(result.time / DT)
+    model = MPM(**constants, dt=DT, gravity=(0.0, -EARTH, 0.0))
+    wanted = rollout(model, make_law("hencky", torch.float32), start(), steps=steps, frames=[steps])
+    assert torch.allclose(
+        result.x, wanted.x[0], atol=2e-3
+    )  # the displacement that sticks is forgotten between frames
+    surface = 0.07 + result.time
+    assert surface - 0.02 < float(result.x[:, 1].min()) < surface + 0.1
 
 
 def test_a_tilted_floor_rotates_gravity(live):

@@ -363,6 +363,28 @@ FIGURES = {
             **IN_VIEW,
         },
     },
+    "obstacles": {
+        "kind": "h5",
+        "input": {
+            "truth": [f"{DATA}/{scene}/truth.h5" for scene in DRAWN.obstacles],
+            "meshes": lambda wildcards: [
+                mesh for scene in DRAWN.obstacles for mesh in obstacle_meshes(SimpleNamespace(scene=scene))
+            ],
+        },
+        "params": {
+            "scenes": lambda wildcards: {
+                scene: scene_setting("shape", "size", "height", "center", "appearance")(
+                    SimpleNamespace(scene=scene)
+                )
+                for scene in DRAWN.obstacles
+            },
+            "shown": DRAWN.shown - 1,
+            "size": DRAWN.size,
+            "samples": SETTINGS.dataset.static.samples,
+            "threads": BLENDER.threads,
+        },
+        "resources": {"runtime": 60},
+    },
     "material_response": {
         "kind": "json",
         "input": {"responses": [f"{RESULTS}/{run}/response.json" for *_, runs in RESPONSES for run in runs]},

@@ -1,11 +1,13 @@
 """Render the object: at t = 0 from cameras on a sphere, or in motion from a ring of cameras."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from neuma_lib.config.blender import AppearanceConfig, ImagesConfig
 from neuma_lib.data.blender.bodies import make_body
 from neuma_lib.data.blender.scene import render_dynamic, render_static
-from neuma_lib.geometry.obstacles import obstacles
+from neuma_lib.errors import InputError
+from neuma_lib.geometry.obstacles import obstacles, sees_all
 from neuma_lib.geometry.shapes import place
 from neuma_lib.io.files import listed, parse_json
 from neuma_lib.io.hdf5 import read_arrays
@@ -13,6 +15,9 @@ from neuma_lib.io.simulator import with_obstacles
 from neuma_lib.splatting.viewpoints import static_views, video_views
 from workflow.inputs import solid
 from workflow.stage import run_script
+
+MIN_VIEWS = 8
+"""Least number of views at t = 0 that see all of the body."""
 
 
 def main(inputs, output, params, run) -> None:
@@ -30,7 +35,16 @@ def main(inputs, output, params, run) -> None:
     folder = Path(output.transforms).parent
     simulation = with_obstacles(parse_json(attributes.get("simulation", "{}"), inputs.truth))
     times = [step * attributes["dt"] for step in steps]
-    around = obstacles(simulation.get("colliders", ()), times)
+    colliders = simulation.get("colliders", ())
+    around = obstacles(colliders, times)
+    if colliders and not params.moving:  # a hull of masks would lose what an obstacle hides in a view
+        whole = sees_all(colliders, views.c2w[:, :3, 3], body.points)
+        if whole.sum() < MIN_VIEWS:
+            problem = f"hide a part of the body in all but {whole.sum()} of {len(views)} views at t = 0"
+            raise InputError(
+                "colliders", problem, f"Move them. At least {MIN_VIEWS} views must see all of it"
+            )
+        views = replace(views, c2w=views.c2w[whole])
     how = (folder, images.samples, params.threads, run.progress, params.device, around)
     if params.moving:
         render_dynamic(body, views, steps, attributes["dt"], *how)

@@ -41,7 +41,7 @@ class SpringModel:
     @classmethod
     def of(cls, model: MPM, substeps: int = 1) -> SpringModel:
         """Gravity, time step and box of an MPM model, with planes where bodies come to rest in it."""
-        if model.colliders:
+        if model.colliders or model.clamps:
             raise InputError(
                 "spring_gaus", "springs touch only the faces of the cube", "Leave this method out"
             )

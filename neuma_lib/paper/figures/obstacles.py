@@ -1,4 +1,4 @@
-"""True motions of scenes with obstacles, without training: a soft ball rolls down a stair, a plate presses a ball of
+"""True motions of scenes with obstacles, without training: a soft ball rolls down a stair, a press flattens a ball of
 clay, and sand runs through an hourglass, which is drawn as glass. Not in the paper.
 """
 
@@ -27,9 +27,9 @@ from neuma_lib.splatting.viewpoints import framing
 LEFT, TOP = 0.75, 0.05
 DIRECTION = np.array([0.35, 0.36, 1.0])
 """From the scene to the camera: so far above the floor that no horizon is in the frame."""
-FLOOR, FLOOR_REACH = (0.93, 0.93, 0.91), 5.0
+FLOOR, FLOOR_REACH = (0.93, 0.93, 0.91), 40.0
 """Colour of the floor, and half of its side [m], so that it fills the frame."""
-GLASS = 0.15
+GLASS = 0.08
 """Opacity of an obstacle around a body."""
 
 
@@ -61,7 +61,7 @@ def draw(grid: ImageGrid) -> Figure:
 
 
 def _shown(obstacle: Obstacle, middle: np.ndarray) -> Obstacle:
-    """An obstacle as it is drawn: as glass, if it surrounds the middle (3,) [m] of the body."""
+    """An obstacle with the opacity of glass, if it surrounds the middle (3,) [m] of the body."""
     vertices = obstacle.placed(0)
     surrounds = ((vertices.min(axis=0) < middle) & (middle < vertices.max(axis=0))).all()
     return replace(obstacle, opacity=GLASS) if surrounds else obstacle
