@@ -156,15 +156,15 @@ def test_bodies_rest_at_the_wall_of_the_cube(contact, wall, E, fraction):
 def bounce(grid: int, contact: str, E: float = 3e4) -> tuple[float, float]:
     """Lowest place of a falling ball [cells], and height to which its centre rebounds [m].
 
-    The place is that of the surface with contact of particles, and else that of a particle's centre. The time step is a
-    fraction of the cell, because the depth of a penetration [cells] is proportional to (dt / dx)^2 for one pressure.
+    The place is that of the surface with contact of particles, and else that of a particle's centre. With contact of
+    particles the time step is a fraction of the cell, because the depth of an impact is proportional to it.
     """
-    dt = 16 * DT / grid
+    dt = 16 * DT / grid if contact == "particles" else DT
     model = MPM(grid, dt, contact=contact)
     x0, mass, vol0 = ball(grid, (0.5, RADIUS + 0.15, 0.5))
     state = State(x0, torch.tensor([0.0, -1.92, 0.0]), mass, vol0)
     law = analytic_law({"elasticity": {"name": "fixed_corotated", "E": E, "nu": 0.45}}, dt=dt)
-    every = grid // 4
+    every = round(4 * DT / dt)
     path = rollout(model, law, state, steps=225 * every, frames=range(0, 225 * every + 1, every))
     y, v = path.x[..., 1], path.v[..., 1].mean(dim=1)
     up = int((v > 0).int().argmax())
@@ -173,22 +173,31 @@ def bounce(grid: int, contact: str, E: float = 3e4) -> tuple[float, float]:
     return (float(y[:top].min()) - radius) * grid, float(y[top].mean())
 
 
-def test_coarse_grids_meet_the_same_floor():
+DEEPEST = {"particles": -0.25, "nodes": -0.75}
+"""Bound of the lowest place of `bounce` [cells]."""
+
+
+@pytest.mark.parametrize("contact", DEEPEST)
+def test_coarse_grids_meet_the_same_floor(contact):
     """How deep a body goes below y = 0 is a fraction of a cell, the same at both sizes; the finer one loses less."""
-    (low, height), (lower, higher) = bounce(16), bounce(24)
-    assert -0.75 < low < 0 and abs(low - lower) < 0.05
+    (low, height), (lower, higher) = bounce(16, contact), bounce(24, contact)
+    assert DEEPEST[contact] < low < 0 and abs(low - lower) < 0.05
     assert height < higher
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("E, rate", [(3e4, 1.0), (1e5, 0.5)])
-def test_the_rebound_converges_to_the_same_floor(E, rate):
-    """Twice as fine a grid changes the height less than the doubling before it did, and half as much (first order) for
-    a ball that is not squeezed to half its height. Lowest places are one fraction of a cell, so they go to y = 0.
+@pytest.mark.parametrize(
+    "contact, E, rate",
+    [("particles", 3e4, 1.0), ("particles", 1e5, 1.0), ("nodes", 3e4, 1.0), ("nodes", 1e5, 0.5)],
+)
+def test_the_rebound_converges_to_the_same_floor(contact, E, rate):
+    """Twice as fine a grid changes the height less than the doubling before it did, and with nodes half as much (first
+    order) for a ball that is not squeezed to half its height. Lowest places are one fraction of a cell, so they go to
+    y = 0.
     """
     grids = (16, 24, 32, 48, 64)
-    lows, heights = zip(*(bounce(grid, E) for grid in grids), strict=True)
-    assert max(lows) - min(lows) < 0.06 and -0.75 < min(lows)
+    lows, heights = zip(*(bounce(grid, contact, E) for grid in grids), strict=True)
+    assert max(lows) - min(lows) < 0.06 and DEEPEST[contact] < min(lows)
     assert all(a < b for a, b in zip(heights, heights[1:], strict=False))
     assert heights[4] - heights[2] < rate * (heights[2] - heights[0])
     assert heights[4] - heights[3] < heights[3] - heights[2]
