@@ -62,11 +62,11 @@ class IdentifyConfig(Section):
     longest_step: float = internal(1.0, "maximum change of an unbounded constant in a step", gt=0)
     # A prior on constants that the video does not determine.
     spread: float = internal(3.0, "expected distance of the unbounded constants from their start", gt=0)
-    prune_factor: float = Field(
+    prune_factor: float = internal(
         4.0,
-        gt=1,
-        description="families with squared residuals above this multiple of the best are dropped. If those of held-out "
+        "families with squared residuals above this multiple of the best are dropped. If those of held-out "
         "frames exceed those of fitted ones by it, the fit to all frames restarts",
+        gt=1,
     )
     penalty: float = Field(
         0.05, ge=0, description="relative decrease of the held-out loss required for each additional constant"
