@@ -24,10 +24,11 @@ class Clamp(Motion):
     """Particles that start in a box follow a rigid motion until they are released.
 
     Clamped particles are not part of the material: they add neither mass nor stress to the grid. A node whose mass is
-    clamped by a share of more than `HELD_SHARE` moves with the clamp instead. So the clamp is rigid, and loads do not
-    creep: if clamped particles only had prescribed velocities, a node between them and the body would move by dt f / m
-    under a constant force f in each step. Clamped particles move exactly with the clamp, and their deformation turns
-    with it, so that a release continues without a jump. A particle in several clamps follows the first.
+    clamped by a share of more than `HELD_SHARE` moves with the clamp instead. So the clamp is rigid, and a load does
+    not creep: if clamped particles only had prescribed velocities, a node between them and the body would move by
+    dt^2 f / m in each step under a constant force f. Clamped particles move exactly with the clamp, and their
+    deformation turns with it, so that a release continues without a jump. A particle in several clamps follows the
+    first.
 
     Attributes:
         lowest, highest: corners of the box at t = 0 [m].
