@@ -129,7 +129,7 @@ def test_an_impact_takes_the_time_of_hertz():
 def test_no_particle_sinks_deeper_than_a_quarter_of_a_cell(name):
     """Random particles at 3 m/s.
 
-    The penalty spring stops a lone particle of speed v at the depth v dt / sqrt(alpha) = 0.1 dx below its first contact,
+    A lone particle of speed v stops at the depth v dt / sqrt(alpha) = 0.1 dx below its first contact,
     which is r = 0.24 dx above the floor. Particles with a body behind them go deeper.
     """
     model = MPM(24, 1e-3, contact="particles")
