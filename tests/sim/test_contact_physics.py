@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from neuma_lib.mechanics.analytic import analytic_law
-from neuma_lib.sim.colliders import CONTACT_STIFFNESS, Collider, contact_radius
+from neuma_lib.sim.colliders import Collider, contact_radius
 from neuma_lib.sim.model import MPM
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
@@ -129,13 +129,12 @@ def test_an_impact_takes_the_time_of_hertz():
 def test_no_particle_sinks_deeper_than_a_quarter_of_a_cell(name):
     """Random particles at 3 m/s.
 
-    The penalty spring stops a lone particle of speed v at the depth v dt / sqrt(alpha) below its first contact at r:
-    at -0.08 dx here. A body presses harder, but its particles have the same mass per area of contact.
+    A lone particle of speed v stops at the depth v dt / sqrt(alpha) = 0.1 dx below its first contact,
+    which is r = 0.24 dx above the floor. Particles with a body behind them go deeper.
     """
     model = MPM(24, 1e-3, contact="particles")
     x, mass, vol0 = (value.float() for value in cube(1000, side=0.2, centre=(0.5, 0.15, 0.5)))
     speed, radius = 3.0, float(contact_radius(vol0)[0])
-    assert speed * model.dt / math.sqrt(CONTACT_STIFFNESS) - radius < 0.25 * model.dx
     x[:, 1] += radius + 0.005 - x[:, 1].min()
     start = State(x, torch.tensor([0.4, -speed, 0.2]), mass, vol0)
     path = rollout(model, make_law(name), start, steps=300, frames=range(0, 301, 2))
