@@ -70,8 +70,8 @@ def test_segments_do_not_change_the_gradient(cache_bytes):
 
 
 @pytest.mark.parametrize("name", ["moving", "sticking"])
-def test_copies_equal_rollouts_of_their_own(name):
-    """Laws and starts of their own; free flight ends for all copies with the first contact of any."""
+def test_copies_equal_single_rollouts(name):
+    """Each has its law and its start; free flight ends for all copies with the first contact of any."""
     model, start = falling_on(COLLIDERS[name])
     lifted = replace(start, x=start.x + 0.01 * torch.tensor([0.0, 1.0, 0.0]).double())
     slow = State(start.x, 0.5 * start.v, start.mass, start.vol0)
@@ -183,13 +183,13 @@ def states_of(model, start, law):
     (slab,) = model.colliders
     *now, stuck = *start.motion, torch.zeros_like(start.x)
     lowest = start.x[:, 1] < start.x[:, 1].min() + 1e-3
-    found = set()
+    regimes = set()
     for n in range(3):
         own = now[0][lowest], now[1][lowest], stuck[lowest], 0.5 * start.vol0[lowest] ** (1 / 3)
         _, s, touching = torch_simulation.touched(slab, *own, model.dt, n * model.dt)
         _, free, _ = torch_simulation.touched(replace(slab, friction=math.inf), *own, model.dt, n * model.dt)
         kinds = torch.where(touching, 1 + ((s - free).norm(dim=1) > 1e-12).int(), 0)
-        found |= {("apart", "stick", "slip")[kind] for kind in kinds.tolist()}
+        regimes |= {("apart", "stick", "slip")[kind] for kind in kinds.tolist()}
         regions = [MaterialRegion(law, 0, len(start.x))]
         *now, stuck = torch_simulation.step(model, regions, *now, stuck, start.mass, start.vol0, n * model.dt)
-    return found
+    return regimes
