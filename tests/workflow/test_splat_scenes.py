@@ -34,9 +34,13 @@ def settings(**splat):
     scenes = {"Splat": scene, "BouncyBall": {"prior": "made/law.safetensors"}}
     return overlay(
         scenes=scenes,
-        figures={"i23d": ["BouncyBall"], "methods": ["nclaw"]},
+        figures={"methods": ["nclaw"]},
         viewer={"methods": ["nclaw+law_from=BouncyBall"]},
-        advanced={"scenes.Splat.splat.views": 12, "scenes.Splat.splat.pixels": 48},
+        advanced={
+            "scenes.Splat.splat.views": 12,
+            "scenes.Splat.splat.pixels": 48,
+            "figures.i23d": ["BouncyBall"],
+        },
         dataset={"frames": 11},
     )
 
