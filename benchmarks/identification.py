@@ -32,7 +32,7 @@ from benchmarks.project_scenes import (
 from benchmarks.timing import core_seconds
 from neuma_lib.config.identify import IdentifyConfig
 from neuma_lib.evaluation.metrics import tracer_errors
-from neuma_lib.fitting.identified import Identified
+from neuma_lib.fitting.identified import FamilyFit, Identified
 from neuma_lib.fitting.identify import identify
 from neuma_lib.io.files import write_json
 from neuma_lib.io.hdf5 import read_arrays
@@ -67,7 +67,8 @@ def evaluate(job: tuple[str, Config, Mapping[str, Any]]) -> dict[str, Any]:
         "truth": truth,
         "core_seconds": seconds,
         **_family(identified, truth),
-        "quantities": _quantities(identified, truth),
+        "quantities": _quantities(identified.best, identified, truth),
+        "material": _quantities(identified.material, identified, truth) if identified.material else {},
         "combinations": _combinations(identified, truth),
         "found": identified.as_dict(),
     }
@@ -107,7 +108,7 @@ def _constants(spec: Mapping[str, Any]) -> dict[str, float]:
     return {key: float(value) for part in spec.values() for key, value in part.items() if key != "name"}
 
 
-def _quantities(identified: Identified, truth: Mapping[str, Any]) -> dict[str, Any]:
+def _quantities(fit: FamilyFit, identified: Identified, truth: Mapping[str, Any]) -> dict[str, Any]:
     """Named combinations that also exist in the truth: value, truth, standard deviation of the logarithm, z score."""
     true = named_combinations(_constants(truth))
     return {
@@ -118,7 +119,7 @@ def _quantities(identified: Identified, truth: Mapping[str, Any]) -> dict[str, A
             "z": math.log(value / true[key]) / std,
             "determined": std < identified.settings.determined,
         }
-        for key, value, std in identified.best.quantities(identified.settings)
+        for key, value, std in fit.quantities(identified.settings)
         if key in true
     }
 
@@ -140,8 +141,8 @@ def _combinations(identified: Identified, truth: Mapping[str, Any]) -> list[dict
 def summary(rows: Sequence[Mapping[str, Any]]) -> str:
     """Coverage, closeness, choice of family, motion and time over scenes, as lines."""
     lines = []
-    for kind in ("quantities", "combinations"):
-        entries = [e for row in rows for e in (row[kind].values() if kind == "quantities" else row[kind])]
+    for kind in ("quantities", "material", "combinations"):
+        entries = [e for row in rows for e in (row[kind] if kind == "combinations" else row[kind].values())]
         sure = [e for e in entries if e["determined"]]
         if sure:
             covered = sum(abs(e["z"]) < COVERED for e in sure)
@@ -168,9 +169,10 @@ def lines_of(row: Mapping[str, Any]) -> str:
         f"{row['found']['rollouts']} rollouts, {row['core_seconds']:.0f} core s; "
         + ", ".join(f"{key[5:]} {value:.2f}" for key, value in row.items() if key.startswith("rmse"))
     ]
-    for key, e in row["quantities"].items():
+    both = [(of, *item) for of in ("quantities", "material") for item in row[of].items()]
+    for of, key, e in both:
         lines.append(
-            f"    {key:16} {e['value']:10.4g} true {e['truth']:10.4g} ({e['value'] / e['truth'] - 1:+.0%}) "
+            f"    {of:10} {key:16} {e['value']:10.4g} true {e['truth']:10.4g} ({e['value'] / e['truth'] - 1:+.0%}) "
             f"log std {e['log_std']:.3f} z {e['z']:+.1f} {'determined' if e['determined'] else ''}"
         )
     return "\n".join(lines)

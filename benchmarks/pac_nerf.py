@@ -16,7 +16,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from benchmarks.timing import core_seconds, parser_of
 from neuma_lib.evaluation.text_tables import as_markdown
@@ -29,7 +28,7 @@ from neuma_lib.methods.pac_nerf.lattice import Lattice
 from neuma_lib.methods.pac_nerf.options import PacFamilyConfig, PacNerfConfig
 from neuma_lib.methods.pac_nerf.rendering import Opacity, camera_rays
 from neuma_lib.project.loading import load, merged, read_yaml
-from neuma_lib.sim.model import MPM
+from neuma_lib.sim.model import MPM, contact_clearance
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 from neuma_lib.splatting.cameras import Cameras, look_at
@@ -109,9 +108,9 @@ def film(
     return Observation(frames, images, view)
 
 
-def contact(x: Tensor, frames: tuple[int, ...]) -> int:
-    """Step of the last frame before particles at x, launched with `V0`, interact with the floor."""
-    low = float(x[:, 1].min()) - MODEL.free_range[0]
+def contact(particles: FieldParticles, frames: tuple[int, ...]) -> int:
+    """Step of the last frame before the particles, launched with `V0`, touch the floor."""
+    low = float(contact_clearance(MODEL, particles.x, torch.full((1,), particles.volume)))
     fall = [V0[1] * n * MODEL.dt + MODEL.gravity[1] / 2 * (n * MODEL.dt) ** 2 for n in frames]
     return max(n for n, y in zip(frames, fall, strict=True) if low + y > 0)
 
@@ -135,7 +134,7 @@ def recover(name: str, family: PacFamilyConfig, settings: PacNerfConfig, log=pri
     video = film(field, truth, specification(family, TRUTHS[name]), frames, cameras())
     body = CarriedField(field, 1.0, MIN_OPACITY, settings, DENSITY)
     return fit_pac_nerf(
-        MODEL, body, video, contact(truth.x, frames), FamilyConstants(family), settings, log=log
+        MODEL, body, video, contact(truth, frames), FamilyConstants(family), settings, log=log
     )
 
 

@@ -16,6 +16,7 @@ from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.neural import NeuralLaw, features, neural_law
 from neuma_lib.mechanics.singular_values import rotation_and_singular_values
+from neuma_lib.sim.colliders import contact_radius
 from neuma_lib.sim.model import MPM
 from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.gaussians import Gaussians
@@ -24,7 +25,7 @@ from neuma_lib.splatting.observation import Observation
 DENSITY = 1000.0  # kg/m^3
 SOFT = {"elasticity": {"name": "fixed_corotated", "E": 3e4, "nu": 0.3}}
 RADIUS = 0.15  # m
-FREE_HEIGHT = 0.01  # m above the zone that feels the floor
+FREE_HEIGHT = 0.01  # m above the height at which it touches the floor
 VELOCITY = (0.3, -2.0, 0.1)  # m/s
 
 
@@ -75,11 +76,12 @@ def make_scene(size: Size, device: torch.device) -> BenchmarkScene:
     """The scene on a device, in float32."""
     generator = torch.Generator().manual_seed(0)
     model = MPM(size.grid, size.dt)
-    centre = torch.tensor([0.5, model.free_range[0] + FREE_HEIGHT + RADIUS, 0.5])
+    vol0 = torch.full((size.particles,), 4 / 3 * torch.pi * RADIUS**3 / size.particles)
+    low = model.free_range[0] + float(contact_radius(vol0[0]))
+    centre = torch.tensor([0.5, low + FREE_HEIGHT + RADIUS, 0.5])
     x0 = centre + RADIUS * _in_unit_ball(size.particles, generator)
     # as a jittered lattice would number them: along lines, so that neighbours in memory are neighbours in space
     x0 = x0[torch.argsort((x0 / model.dx).long() @ torch.tensor([size.grid**2, size.grid, 1]))]
-    vol0 = torch.full((size.particles,), 4 / 3 * torch.pi * RADIUS**3 / size.particles)
     gaussians = _gaussians(size.gaussians, centre, generator)
     body = Reconstruction(x0, vol0, DENSITY * vol0, gaussians, bind(gaussians.means, gaussians.covars(), x0))
     body = body.to(torch.float32, device)

@@ -1,6 +1,6 @@
 """Copy the tables and figures of a run to docs/results, and update the numbers on the pages that show them.
 
-python -m docs.record            # after: snakemake --cores 2 tables figures random results/finer_truth.csv
+python -m docs.record            # after: snakemake --cores 2 tables figures random results/table1_converged.csv
 python -m docs.record --configfile config/studies/three_chains.yaml     # after the same with this option
 
 The first line of a recorded table names date, commit and machine. Text between `<!-- name -->` and `<!-- /name -->` is
@@ -38,7 +38,7 @@ MADE_BY = {
     "table5": "tables figures",
     "uneven_mass": "tables figures",
     "ablation_gradients": "tables figures",
-    "finer_truth": "results/finer_truth.csv",
+    "table1_converged": "results/table1_converged.csv",
     "random": "random",
     "initial_states": "tables figures",
     "yardstick": "results/yardstick.csv",

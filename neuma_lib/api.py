@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError
 from neuma_lib.evaluation.metrics import tracer_errors
 from neuma_lib.fitting import identify as identification
-from neuma_lib.fitting.families import FAMILIES
+from neuma_lib.fitting.families import FAMILIES, FRICTION
 from neuma_lib.fitting.frame_batches import check_contact
 from neuma_lib.fitting.material import ParticleLoss, TrajectoryLoss, train_material
 from neuma_lib.fitting.structured_fit import train_structured
@@ -162,6 +162,8 @@ class Identification:
         constants: constants by name, in SI units.
         std: standard deviations of the logarithms of the constants. Empty if they could not be estimated.
         ties: families that predict the held-out frames as well.
+        contact_friction: ``value`` of the Coulomb coefficient and ``log_std``, the standard deviation of its logarithm,
+            or ``at_least`` if the body may stick. Empty if it was not fitted. `MPM.with_friction` applies it.
     """
 
     law: Law
@@ -169,6 +171,7 @@ class Identification:
     constants: dict[str, float]
     std: dict[str, float]
     ties: tuple[str, ...]
+    contact_friction: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -266,12 +269,14 @@ def identify(
     video = _video(scene)
     motion = scene.motion or estimate_motion(body, video, scene.mpm)
     result = identification.identify(scene.mpm, motion, body, _of_body(video, body), settings)
-    best, std = result.best, {}
+    best, std, friction = result.best, {}, {}
     if best.covariance is not None:
         names, covariance = best.log_covariance(lambda constants: constants)
         std = dict(zip(names, np.sqrt(np.diag(covariance)).tolist(), strict=True))
+        friction = best.contact_friction(settings)
     law = Law.from_spec(best.family.law_spec(best.values), scene.mpm.dt)
-    return Identification(law, best.family.name, dict(best.values), std, tuple(result.ties))
+    constants, std = ({k: v for k, v in values.items() if k != FRICTION} for values in (best.values, std))
+    return Identification(law, best.family.name, constants, std, tuple(result.ties), friction)
 
 
 def adapt(law: Law, scene: Scene, options: Mapping[str, Any] | None = None) -> Adaptation:

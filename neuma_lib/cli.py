@@ -281,8 +281,10 @@ def _of_method(options: argparse.Namespace) -> tuple[Law, dict[str, Any]]:
     case = cases.case(settings, scene, method)
     if not case.method.has_law:
         raise InputError(options.source, "its motion follows from no material law", "Choose another method")
-    law = case.source().load(lambda file: str(root / file)).law
-    origin = cases.law_origin(settings, scene, method)
+    model = case.source().load(lambda file: str(root / file))
+    law, origin = model.exported, cases.law_origin(settings, scene, method)
+    if law is not model.law:
+        origin["grid"] = None
     files = {"metrics": place / "metrics.json", "rollout": place / "rollout.h5"}
     of_this = {name: file for name, file in files.items() if file.is_file() and origin["scene"] == scene}
     return law, {**origin, **of_this, "any_time_step": options.any_time_step, "commit": head_commit(root)}

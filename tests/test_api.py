@@ -15,7 +15,7 @@ from neuma_lib.fitting.families import FAMILIES
 from neuma_lib.io.images import write_transforms
 from neuma_lib.mechanics.neural import neural_law
 from tests.support.errors import refused
-from tests.support.grounding_scene import MODEL, ball, camera, observe
+from tests.support.grounding_scene import HEIGHT, MODEL, ball, camera, observe
 from tests.support.viewer_project import STEPS, make_project
 
 pytestmark = pytest.mark.core
@@ -27,7 +27,7 @@ FRAMES = tuple(range(0, 121, 8))
 
 
 def moving(v0=V0) -> nm.InitialMotion:
-    return nm.InitialMotion(np.array(v0), np.zeros(3), np.array([0.5, 0.3, 0.5]), np.eye(3), np.zeros(6))
+    return nm.InitialMotion(np.array(v0), np.zeros(3), np.array([0.5, HEIGHT, 0.5]), np.eye(3), np.zeros(6))
 
 
 @pytest.fixture(scope="module")
@@ -43,10 +43,17 @@ def scene() -> nm.Scene:
 def test_the_example_of_the_readme_runs(capsys):
     (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
     names = {}
+    torch.manual_seed(0)
     exec(code, names)
     assert "torch.Size([21, 2000, 3])" in capsys.readouterr().out
-    gradient = names["v"].grad
-    assert gradient.isfinite().all() and gradient[1] > 0
+    gradient, start = names["v"].grad, names["state"]
+    assert gradient.isfinite().all()
+    heights = []
+    for change in (0.01, -0.01):  # many particles start contact within it: the mean slope of many pieces
+        moved = replace(start, v=torch.tensor([0.0, -1.0 + change, 0.0]))
+        path = nm.simulate(nm.MPM(grid=24, dt=1e-3), names["law"], moved, frames=[200])
+        heights.append(float(path.x[-1, :, 1].mean()))
+    assert gradient[1] == pytest.approx((heights[0] - heights[1]) / 0.02, rel=0.05)
 
 
 def test_a_simulation_ends_at_its_last_frame(scene):
@@ -79,10 +86,25 @@ def test_a_material_is_identified(scene):
     options = {"pyramid": (8, 24), "iterations": 4, "covariance_from": "elastic", "gaussian_motion": "mean"}
     material = nm.identify(scene, families, options)
     assert material.family == "hencky" and material.ties == () and set(material.std) == {"E", "nu"}
+    assert material.contact_friction == {}
     assert material.constants["E"] == pytest.approx(1.5e4, rel=0.1)
     assert float(material.law.elasticity.values["E"]) == material.constants["E"]
     with refused("options.particles"):
         nm.identify(scene, families, {"particles": 100})
+
+
+def test_friction_is_identified_next_to_the_constants(scene):
+    """A ball that slides before it rolls, in a video without noise."""
+    rough = replace(MODEL, contact="particles")
+    body = scene.reconstruction
+    video = nm.Video((observe(body, V0, FRAMES, SOFT, size=24, model=rough.with_friction(0.2)),))
+    families = {"hencky": {"elasticity": {"name": "hencky", "E": 3e4, "nu": 0.3}}}
+    options = {"pyramid": (8, 24), "covariance_from": "elastic", "gaussian_motion": "mean"}
+    slippery = nm.Scene(rough, body, video, scene.motion)
+    material = nm.identify(slippery, families, {**options, "contact_friction": "fitted"})
+    assert set(material.constants) == set(material.std) == {"E", "nu"}
+    assert material.contact_friction["value"] == pytest.approx(0.2, rel=0.1)
+    assert material.contact_friction["log_std"] < 0.5
 
 
 def test_the_default_families_are_those_of_the_shipped_settings():

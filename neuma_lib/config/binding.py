@@ -18,6 +18,4 @@ class BindingConfig(Section):
         ge=1,
         description="maximum number of particles of a Gaussian, the nearest; null: all in the ellipsoid (paper)",
     )
-    equal_mass: bool = Field(
-        False, description="give all particles, added ones included, equal volumes (paper)"
-    )
+    equal_mass: bool = internal(False, "give all particles, added ones included, equal volumes (paper)")

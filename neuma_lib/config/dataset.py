@@ -2,28 +2,48 @@
 
 from __future__ import annotations
 
+from typing import Annotated, Literal
+
 from pydantic import Field, model_validator
 
 from neuma_lib.config.base import Section, Seed
 from neuma_lib.config.blender import BlenderConfig, ImagesConfig
 
+CONVERGED = "converged"
+CONVERGED_CELLS = 96
+"""Least number of grid cells along each side of a converged truth."""
+
+Cells = Annotated[int, Field(ge=8)]
+
 
 class TruthConfig(Section):
-    """Resolution of the ground truth of one scene."""
+    """Resolution of the ground truth of one scene. `truth: converged` is short for `truth: {grid: converged}`."""
 
-    grid: int | None = Field(None, ge=8, description="grid cells along each side; null: dataset.grid")
+    grid: Cells | Literal["converged"] | None = Field(
+        None, description="grid cells along each side, as dataset.grid; null: dataset.grid"
+    )
     dt: float | None = Field(None, gt=0, description="time step [s]; null: dataset.dt")
-    particles: int | None = Field(None, gt=0, description="number of particles; null: dataset.particles")
+    particles: int | None = Field(
+        None,
+        gt=0,
+        description="number of particles; null: dataset.particles, or 8 in a cell of a converged truth",
+    )
 
 
 class DatasetConfig(Section):
     """Ground truth and its images."""
 
     particles: int = Field(
-        8000, gt=0, description="particles of the ground truth, at least four times geometry.particles"
+        8000,
+        gt=0,
+        description="particles of the ground truth, at least four times geometry.particles. Its file has at most as "
+        "many, drawn from those of a converged truth",
     )
-    grid: int | None = Field(
-        None, ge=8, description="grid cells of the ground truth along each side; null: simulation.grid"
+    grid: Cells | Literal["converged"] | None = Field(
+        None,
+        description="grid cells of the ground truth along each side; null: simulation.grid; converged: the least "
+        "even multiple of simulation.grid from 96, with a time step refined by the same factor, 8 particles in a "
+        "cell, and an estimate of the change that a doubled grid would make",
     )
     dt: float | None = Field(
         None,

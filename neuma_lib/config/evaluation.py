@@ -19,11 +19,11 @@ class EvaluationConfig(Section):
         description="views of the image metrics; null: views outside the training, else outside `training.views`, else "
         "the training views, with a note in results and figures",
     )
-    margin: float = Field(
+    margin: float = internal(
         0.1,
-        ge=0,
-        description="margin of the crop for image metrics around the object, observed and predicted, as a fraction of "
+        "margin of the crop for image metrics around the object, observed and predicted, as a fraction of "
         "the longer side",
+        ge=0,
     )
     states: int = internal(2000, "states of the true motion on which stresses are compared", ge=1)
     paths: int = internal(250, "maximum number of particles along whose motion stresses are compared", ge=1)

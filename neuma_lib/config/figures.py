@@ -29,9 +29,9 @@ class FiguresConfig(Section):
     main_res: tuple[str, ...] = Field(
         ("BouncyBall", "RubberPawn", "ClayCat"), min_length=1, description="scenes of the renders over time"
     )
-    particles_app: str = Field("JellyDuck", description="scene whose particles are shown for all methods")
-    lora_alphav: tuple[str, ...] = Field(
-        ("BouncyBall", "RubberPawn"), min_length=1, description="scenes of the interpolation"
+    particles_app: str = internal("JellyDuck", "scene whose particles are shown for all methods")
+    lora_alphav: tuple[str, ...] = internal(
+        ("BouncyBall", "RubberPawn"), "scenes of the interpolation", min_length=1
     )
     methods: tuple[str, ...] = Field(
         ("neuma", "neuma_structured"),
@@ -49,10 +49,10 @@ class FiguresConfig(Section):
     letters: tuple[str, ...] = Field((), description="experiments with one letter each, in order")
     meetings: tuple[str, ...] = Field((), description="experiments with several objects")
     ext_time: str = Field("", description="experiment that is longer than the video of its scene")
-    i23d: tuple[str, ...] = Field(
+    i23d: tuple[str, ...] = internal(
         ("JellyDuck", "ClayCat", "HoneyBottle"),
+        "scenes whose laws, learned by the first of `methods`, move all splats",
         min_length=1,
-        description="scenes whose laws, learned by the first of `methods`, move all splats",
     )
     realworld: tuple[str, ...] | None = internal(
         None, "captures in that figure; null: captures.released, else the demo captures", min_length=1
@@ -60,14 +60,14 @@ class FiguresConfig(Section):
     realworld_methods: tuple[str, ...] = internal(
         ("spring_gaus", "neuma"), "methods next to the videos of realworld", min_length=1
     )
-    gradient_analysis: tuple[str, ...] = Field(
-        ("BouncyBall", "RubberPawn"), min_length=1, description="scenes of the gradient norms"
+    gradient_analysis: tuple[str, ...] = internal(
+        ("BouncyBall", "RubberPawn"), "scenes of the gradient norms", min_length=1
     )
-    pipeline: str = Field("ClayCat", description="scene that is shown through all stages")
-    material_response: tuple[str, ...] = Field(
+    pipeline: str = internal("ClayCat", "scene that is shown through all stages")
+    material_response: tuple[str, ...] = internal(
         ("BouncyBall", "JellyDuck", "RubberPawn", "ClayCat", "SandFish", "HoneyBottle"),
+        "scenes of the tests of material points",
         min_length=1,
-        description="scenes of the tests of material points",
     )
     obstacles: tuple[str, ...] = internal(
         ("JellyStair", "ClayPress", "SandGlass"),

@@ -9,6 +9,9 @@ from pydantic import Field
 from neuma_lib.config.base import Compared, Section, internal
 from neuma_lib.config.laws import LawConfig
 
+FRICTION_NEEDS = "fitted needs contact of particles", "Set simulation.contact: particles"
+"""Problem and remedy where friction is to be fitted with another contact."""
+
 
 class IdentifyConfig(Section):
     """Identification of the family and the constants of the material from the video, without training."""
@@ -26,13 +29,21 @@ class IdentifyConfig(Section):
     compare: Compared = Field("colour", description="compared quantity, as `training.compare`")
     covariance_from: Literal["elastic", "total"] = internal("total", "as `training.covariance_from`")
     gaussian_motion: Literal["mean", "affine"] = internal("affine", "as `training.gaussian_motion`")
+    contact_friction: Literal["given", "fitted"] = Field(
+        "given",
+        description="Coulomb coefficient of the body and its obstacles: that of the scene, or fitted to the video, "
+        "which needs `simulation.contact: particles`",
+    )
     frames: int = Field(33, ge=4, description="maximum number of frames, evenly spaced")
-    # Residuals of bodies with these particles measure the discretisation error.
+    # A second discretisation. Constants of the material are extrapolated from both.
     refined_particles: int = Field(
         8000,
         ge=0,
-        description="particles of the bodies that correct for the discretisation, more than `geometry.particles`; 0: "
-        "no correction",
+        description="particles of the bodies on the finer grid, more than `geometry.particles`; 0: no finer grid, and "
+        "no constants of the material",
+    )
+    refinement: int = internal(
+        2, "grid cells and steps of the finer grid, relative to the simulation's", ge=2
     )
     pose_tolerance: float = internal(1e-3, "expected shift [m] and enlargement of the rendered body", ge=0)
     resamplings: int = internal(
@@ -51,11 +62,11 @@ class IdentifyConfig(Section):
     longest_step: float = internal(1.0, "maximum change of an unbounded constant in a step", gt=0)
     # A prior on constants that the video does not determine.
     spread: float = internal(3.0, "expected distance of the unbounded constants from their start", gt=0)
-    prune_factor: float = Field(
+    prune_factor: float = internal(
         4.0,
-        gt=1,
-        description="families with squared residuals above this multiple of the best are dropped. If those of held-out "
+        "families with squared residuals above this multiple of the best are dropped. If those of held-out "
         "frames exceed those of fitted ones by it, the fit to all frames restarts",
+        gt=1,
     )
     penalty: float = Field(
         0.05, ge=0, description="relative decrease of the held-out loss required for each additional constant"

@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 
 from neuma_lib.config.base import Section, Vector, internal
 from neuma_lib.config.blender import AppearanceConfig
-from neuma_lib.config.dataset import TruthConfig
+from neuma_lib.config.dataset import CONVERGED, TruthConfig
 from neuma_lib.config.laws import LawConfig
 from neuma_lib.config.obstacles import ClampConfig, ColliderConfig
 from neuma_lib.config.splats import SplatConfig
@@ -137,10 +137,12 @@ class SceneConfig(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _without_truth(cls, raw: Any) -> Any:
-        """Add the keys of the truth, null, to a scene of a capture or a splat."""
+    def _complete(cls, raw: Any) -> Any:
+        """Write short forms in full, and add the keys of the truth, null, to a scene of a capture or a splat."""
         if not isinstance(raw, Mapping):
             return raw
+        if raw.get("truth") == CONVERGED:
+            raw = {**raw, "truth": {"grid": CONVERGED}}
         if isinstance(raw.get("splat"), str):
             raw = {**raw, "splat": {"file": raw["splat"]}}
         if raw.get("splat"):

@@ -21,13 +21,11 @@ class StructuredConfig(Section):
     blocks: int = internal(4, "equal parts of the video, of each of which the last frames are held out", ge=1)
     # `training.iterations` follow on all frames, for the selected parts.
     trial_iterations: int = internal(10, "optimiser steps before the parts are selected", ge=1)
-    margin: float = Field(
-        0.05, ge=0, description="relative decrease of the held-out loss required to correct a part of the law"
+    margin: float = internal(
+        0.05, "relative decrease of the held-out loss required to correct a part of the law", ge=0
     )
-    rivals: int = Field(
-        1,
-        ge=0,
-        description="number of tied families with another return map that are corrected for comparison",
+    rivals: int = internal(
+        1, "number of tied families with another return map that are corrected for comparison", ge=0
     )
     # The largest that the held-out frames fit equally well is used.
     penalties: tuple[float, ...] = internal((), "candidates for `training.penalty`")

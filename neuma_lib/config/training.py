@@ -54,10 +54,10 @@ class TrainingConfig(MotionOptions):
     max_recoveries: int = internal(
         6, "maximum number of returns to the best state, then training is unstable", ge=0
     )
-    checkpoint_every: int = Field(10, ge=1, description="iterations between checkpoints")
-    adjoint_precision: Literal["single", "half"] = Field(
+    checkpoint_every: int = internal(10, "iterations between checkpoints", ge=1)
+    adjoint_precision: Literal["single", "half"] = internal(
         "single",
-        description="factors of the matrix products in the adjoint of a neural law on a GPU: 22 bits, or 11 bits, "
+        "factors of the matrix products in the adjoint of a neural law on a GPU: 22 bits, or 11 bits, "
         "which is faster and has relative gradient errors of 1e-3",
     )
     memory: float | None = Field(

@@ -15,6 +15,10 @@ from neuma_lib.mechanics.combinations import Values
 from neuma_lib.sim.model import COURANT_LIMIT, MPM
 
 _PARTS = {"elasticity": ELASTICITY, "plasticity": PLASTICITY}
+FRICTION = "contact_friction"
+"""Name of the Coulomb coefficient of a body and its obstacles, a constant that belongs to no law."""
+_FRICTION_GUESS = 0.5
+_NO_FLOW = ("E", "nu", FRICTION)
 _LIMIT_SHARE = 0.999  # of the largest stable stiffness, since constants are rounded
 _MAX_LOGIT = 12.0  # logits beyond it equal the bound to six digits
 
@@ -52,10 +56,11 @@ class Family:
         spec: elasticity and plasticity by name, with initial guesses of all constants.
         constants: names of the constants in order.
         guess: their values in ``spec``.
+        contact_friction: whether the last constant is `FRICTION`.
     """
 
-    def __init__(self, name: str, spec: Mapping[str, Mapping[str, Any]]):
-        self.name, self.spec = name, spec
+    def __init__(self, name: str, spec: Mapping[str, Mapping[str, Any]], contact_friction: bool = False):
+        self.name, self.spec, self.contact_friction = name, spec, contact_friction
         self._constants: dict[str, tuple[str, Constant]] = {}
         self.guess: Values = {}
         analytic_law(spec, dt=1.0, name=name)  # checks names and ranges
@@ -65,6 +70,8 @@ class Family:
                 if key != "name":
                     self._constants[key] = (part, known[given["name"]][key])
                     self.guess[key] = float(value)
+        if contact_friction:
+            self._constants[FRICTION], self.guess[FRICTION] = ("", Constant("1", 0.0)), _FRICTION_GUESS
         self.constants = tuple(self.guess)
         if own := {"E", "nu", "dt"} & set(spec.get("plasticity") or ()):
             raise InputError(
@@ -97,17 +104,19 @@ class Family:
         """Specification of a law for `analytic_law`."""
         spec = {part: {"name": given["name"]} for part, given in self.spec.items()}
         for key, value in values.items():
-            spec[self._constants[key][0]][key] = value
+            if key != FRICTION:
+                spec[self._constants[key][0]][key] = value
         return spec
 
     def unbounded_dict(self, values: Values, covariance: np.ndarray) -> dict[str, Any]:
-        """Unbounded constants with their covariance, for JSON: u = log(value - low) - log(high - value), without the
-        second term if there is no upper bound (``high`` is null)."""
-        bounds = [self._bounds(key) for key in self.constants]
+        """Unbounded constants of the law with their covariance, for JSON: u = log(value - low) - log(high - value),
+        without the second term if there is no upper bound (``high`` is null)."""
+        own = self.constants[: len(self.constants) - self.contact_friction]
+        bounds, k = [self._bounds(key) for key in own], len(own)
         return {
-            "constants": list(self.constants),
-            "values": self.unbounded(values).tolist(),
-            "covariance": covariance.tolist(),
+            "constants": list(own),
+            "values": self.unbounded(values)[:k].tolist(),
+            "covariance": covariance[:k, :k].tolist(),
             "low": [low for low, _ in bounds],
             "high": [high if math.isfinite(high) else None for _, high in bounds],
         }
@@ -120,11 +129,11 @@ class Family:
     @property
     def flows(self) -> bool:
         """Whether it has constants that limit plastic flow."""
-        return any(key not in ("E", "nu") for key in self.constants)
+        return any(key not in _NO_FLOW for key in self.constants)
 
     def with_other_limits(self, values: Values, powers: Sequence[int]) -> list[Values]:
         """Values with constants of plastic flow times 4 to each power (in logarithms or logits); none if elastic."""
-        flow = np.array([key not in ("E", "nu") for key in self.constants])
+        flow = np.array([key not in _NO_FLOW for key in self.constants])
         u = self.unbounded(values)
         return [self.bounded(u + math.log(4) * n * flow) for n in powers] if self.flows else []
 

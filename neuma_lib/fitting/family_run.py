@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -13,7 +14,7 @@ from torch import Tensor
 
 from neuma_lib.config.identify import IdentifyConfig
 from neuma_lib.coupling.initial_motion import InitialMotion
-from neuma_lib.fitting.families import Family
+from neuma_lib.fitting.families import FRICTION, Family
 from neuma_lib.fitting.identified import FamilyFit
 from neuma_lib.fitting.least_squares import (
     MIN_COST,
@@ -26,6 +27,9 @@ from neuma_lib.fitting.video_residuals import MOTION, NUISANCES, Candidate, Vide
 from neuma_lib.mechanics.combinations import Values
 
 _LAST_GAIN = 0.1  # factor on `min_gain` at the last level
+_CLOSE_GAIN = 1e-3  # the same of fits that are compared
+_EXCLUDED = 2.0  # standard deviations at which a Coulomb coefficient is excluded
+_FRICTIONS, _FRICTION_FACTOR = 8, 2.0  # coefficients that are tried together, and their ratio
 _MIN_LOSS = 1e-12  # held-out loss of images that agree exactly
 
 
@@ -35,6 +39,8 @@ def _squares(residual: Iterable[Tensor]) -> float:
 
 class FamilyRun:
     """Fit of one family to the first `counts` frames of each video, with residuals and Jacobians for all levels.
+
+    Residuals are those of the finer discretisation where it has been measured, unless `corrected` is false.
 
     Unknowns are the unbounded constants relative to the start of the fit, and the deviations of the initial motion of
     each video. Residuals and their columns are lists over the observations of all videos.
@@ -46,8 +52,10 @@ class FamilyRun:
         videos: Sequence[VideoResiduals],
         counts: Sequence[int],
         settings: IdentifyConfig,
+        corrected: bool = True,
     ):
         self.family, self.videos, self.counts, self.settings = family, videos, counts, settings
+        self._corrected = corrected
         self.alive, self.refined, self.rollouts, self.steps = False, False, 0, 0
         self.fit: Linearisation | None = None
         self._constants = len(family.constants)
@@ -113,16 +121,15 @@ class FamilyRun:
             self._u = unknowns
             self.refine(self._level)
 
-    def refine(self, level: int) -> None:
-        """Continue the fit at a level of the pyramid."""
+    def refine(self, level: int, closely: bool = False) -> None:
+        """Continue the fit at a level of the pyramid, ``closely`` until its constants are comparable between grids."""
         self._level, last = level, level == len(self.settings.pyramid) - 1
-        unsure = [k for v, video in enumerate(self.videos) if video.by_deviation for k in self._unsure(v)]
         self._u, self.fit, steps = levenberg_marquardt(
             self,
             self._u,
-            [*range(self._constants), *unsure],
+            self._free,
             self._prior,
-            self.settings.min_gain * (_LAST_GAIN if last else 1.0),
+            self.settings.min_gain * (_CLOSE_GAIN if closely else _LAST_GAIN if last else 1.0),
             self.settings.iterations,
             longest=self.settings.longest_step,
         )
@@ -138,14 +145,23 @@ class FamilyRun:
         """Indices of the deviations of a video that are not fixed to 0."""
         return [self._own(v)[k] for k in self.videos[v].unsure]
 
+    @property
+    def _free(self) -> list[int]:
+        """Indices of the unknowns that are fitted."""
+        unsure = [k for v, video in enumerate(self.videos) if video.by_deviation for k in self._unsure(v)]
+        return [*range(self._constants), *unsure]
+
     def measure_discretisation(self, derivatives: bool = False) -> None:
-        """Compute the discretisation correction, and optionally the derivatives by the deviations, at this fit."""
-        law = self.family.law_spec(self.values)
+        """Compute the correction to the finer discretisation, and optionally the derivatives by the deviations, here.
+
+        Other fits need `clear_cache` before they continue.
+        """
         for v, video in enumerate(self.videos):
-            here = Candidate(law, self._u[self._own(v)])
+            here = self._candidate(self._u, v)
             if derivatives:
                 video.differentiate(here)
-            video.refine_particles(here)
+            video.measure_correction(here)
+        self.clear_cache()
 
     def clear_cache(self) -> None:
         """Drop cached residuals after a change of the discretisation correction."""
@@ -197,6 +213,44 @@ class FamilyRun:
             inflated = min(variance * max(predicted / actual, 1.0), self.settings.spread**2)
             whole[:k, :k] += (inflated - variance) * np.outer(axis, axis)
         return whole[:k, :k]
+
+    def lowest_friction(self) -> float | None:
+        """The smallest Coulomb coefficient that the images admit if they also admit sticking, else None, also if it is
+        not fitted.
+
+        An admitted coefficient is at most `_EXCLUDED` standard deviations away. The distance follows from the
+        jackknife with the difference between its images and those of the fit in place of the derivative.
+        """
+        if not self.family.contact_friction or not self._admits([math.inf])[0]:
+            return None
+        value = self.values[FRICTION]
+        for factor in (_FRICTION_FACTOR, _FRICTION_FACTOR ** (1 / _FRICTIONS)):
+            lower = [value / factor**n for n in range(1, _FRICTIONS + 1)]
+            admitted = [*self._admits(lower), False].index(False)
+            value = ([value, *lower])[admitted]
+        return value
+
+    def _admits(self, frictions: Sequence[float]) -> list[bool]:
+        """Whether the images of the fit are compatible with Coulomb coefficients, for other constants as needed."""
+        k, base = self.family.constants.index(FRICTION), self._residual(self._u)
+        points = [self._u.copy() for _ in frictions]
+        for point, friction in zip(points, frictions, strict=True):
+            point[k] = np.log(friction) - self._origin[k]
+        return [
+            other is not None
+            and self._distance(k, [t - r for t, r in zip(other, base, strict=True)]) < _EXCLUDED
+            for other in self._simulate(points)
+        ]
+
+    def _distance(self, k: int, change: list[Tensor]) -> float:
+        """Standard deviations between the best fit along a change of the images and the whole change."""
+        ((key, columns),) = self._columns.items()
+        line, here = copy.copy(self), self._u.copy()
+        line._columns, here[k] = {key: [*columns[:k], change, *columns[k + 1 :]]}, 0.0
+        line.fit = line.linearise(self._u, self._free)
+        P = line._prior(line.fit)
+        step = -np.linalg.pinv(line.fit.curvature + P) @ (line.fit.slope + P @ here)
+        return (1 - step[k]) / math.sqrt(line._covariance()[k, k])
 
     def cost(self, unknowns: np.ndarray) -> float:
         """Sum of squared residuals, infinite if a rollout diverges."""
@@ -284,6 +338,11 @@ class FamilyRun:
         density = min(video.density for video in self.videos)
         return self.family.values(constants, self.videos[0].model, density)
 
+    def _candidate(self, unknowns: np.ndarray, v: int) -> Candidate:
+        """The simulation of a video at unknowns."""
+        values = self._values(unknowns)
+        return Candidate(self.family.law_spec(values), unknowns[self._own(v)], values.get(FRICTION))
+
     def _residual(self, unknowns: np.ndarray) -> list[Tensor] | None:
         key = unknowns.tobytes()
         if key not in self._images:
@@ -299,11 +358,8 @@ class FamilyRun:
         if not points:  # all differences of a step are beyond the stiffness limit of dt
             return []
         self.rollouts += len(points) * len(self.videos)
-        laws = [self.family.law_spec(self._values(point)) for point in points]
         residuals = [
-            video.residuals(
-                [Candidate(law, p[self._own(v)]) for law, p in zip(laws, points, strict=True)], count
-            )
+            video.residuals([self._candidate(point, v) for point in points], count, self._corrected)
             for v, (video, count) in enumerate(zip(self.videos, counts or self.counts, strict=True))
         ]
         return [

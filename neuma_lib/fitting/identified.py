@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from neuma_lib.config.identify import IdentifyConfig
 from neuma_lib.coupling.initial_motion import InitialMotion
-from neuma_lib.fitting.families import Family
+from neuma_lib.fitting.families import FRICTION, Family
 from neuma_lib.mechanics.combinations import Values, named_combinations, physical
+
+REMAINDER = 0.5
+"""Standard deviation of an extrapolation to dx = 0, relative to its change of the constants."""
 
 
 @dataclass
@@ -30,6 +33,7 @@ class FamilyFit:
         refined: whether the fit reached the finest level.
         rollouts: number of simulations.
         steps: number of accepted Levenberg-Marquardt steps.
+        lowest_friction: lower bound of the Coulomb coefficient of a body that may stick, whose family is without it.
     """
 
     family: Family
@@ -42,6 +46,18 @@ class FamilyFit:
     refined: bool = False
     rollouts: int = 0
     steps: int = 0
+    lowest_friction: float | None = None
+
+    def contact_friction(self, settings: IdentifyConfig) -> dict[str, float]:
+        """The fitted Coulomb coefficient of the body and its obstacles for JSON, empty if it was given.
+
+        It is ``value`` with ``log_std``, the standard deviation of its logarithm, or ``at_least`` for a body that may
+        stick.
+        """
+        if self.lowest_friction is not None:
+            return {"at_least": self.lowest_friction}
+        stds = {key: std for key, _, std in self.quantities(settings)}
+        return {"value": self.values[FRICTION], "log_std": stds[FRICTION]} if FRICTION in stds else {}
 
     def widen_by_ties(self, first: FamilyFit, ties: Sequence[FamilyFit]) -> None:
         """Increase the covariance by the disagreement of parts of the video and of families with equal scores.
@@ -57,6 +73,19 @@ class FamilyFit:
         for tie in ties:
             shared = {key: tie.values.get(key, value) for key, value in first.values.items()}
             self.covariance += np.outer(u(shared) - before, u(shared) - before) / (len(ties) + 1)
+
+    def extrapolated(self, coarse: FamilyFit, refinement: int) -> FamilyFit:
+        """This fit, of a grid of ``refinement`` times as many cells as another one's, extrapolated to dx = 0.
+
+        Unbounded constants are linear functions of dx. The covariance is increased by the square of the extrapolated
+        change, times `REMAINDER` squared.
+        """
+        u = self.family.unbounded
+        change = (u(self.values) - u(coarse.values)) / (refinement - 1)
+        covariance = None
+        if self.covariance is not None:
+            covariance = self.covariance + REMAINDER**2 * np.outer(change, change)
+        return replace(self, values=self.family.bounded(u(self.values) + change), covariance=covariance)
 
     def log_covariance(self, of: Callable[[Values], Values]) -> tuple[list[str], np.ndarray]:
         """Names (m,) and covariance (m, m) of logarithms of positive functions of the constants, to first order."""
@@ -122,12 +151,15 @@ class Identified:
     """Result of `identify`.
 
     Attributes:
-        best: the selected family, fitted to all frames.
+        best: the selected family, fitted to all frames on the grid of the simulation. It predicts on that grid.
         ties: names of other families with an equal score.
         fits: all candidates at their evaluation, by name.
         frames: steps of the fitted frames of each video.
         held_out: steps of the held-out frames of each video.
         rollouts: number of simulations, some of which families share.
+        grid: cells along the unit cube of the simulation.
+        material: the selected family with its constants extrapolated to a cell size of zero, for other simulators and
+            data sheets. None without a second grid.
     """
 
     best: FamilyFit
@@ -136,20 +168,29 @@ class Identified:
     frames: list[tuple[int, ...]]
     held_out: list[tuple[int, ...]]
     rollouts: int
+    grid: int
     settings: IdentifyConfig = field(repr=False)
+    material: FamilyFit | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain numbers for JSON; ``law`` is a specification for `analytic_law`."""
+        """Plain numbers for JSON; ``law`` is a specification for `analytic_law`.
+
+        ``contact_friction`` is that of `FamilyFit.contact_friction` if it was fitted.
+        """
         videos = [
             {"start": motion.as_dict(), "frames": list(frames), "held_out_frames": list(held_out)}
             for motion, frames, held_out in zip(self.best.motions, self.frames, self.held_out, strict=True)
         ]
+        friction = self.best.contact_friction(self.settings)
         return {
             "family": self.best.family.name,
+            "grid": self.grid,
             "ties": self.ties,
             "law": self.best.family.law_spec(self.best.values),
+            **({FRICTION: friction} if friction else {}),
             "says": self.summary(),
             "best": self.best.as_dict(self.settings),
+            **({"material": self.material.as_dict(self.settings)} if self.material else {}),
             "families": {name: fit.as_dict(self.settings) for name, fit in self.fits.items()},
             **videos[0],
             **({"further_videos": videos[1:]} if videos[1:] else {}),
@@ -158,9 +199,14 @@ class Identified:
 
     def summary(self) -> str:
         """Summary line: family, constants, and determined quantities."""
-        fit = self.best
+        fit = self.material or self.best
         tied = f" (tie with {', '.join(self.ties)})" if self.ties else ""
         values = ", ".join(f"{key} = {value:.4g}" for key, value in fit.values.items())
+        if self.material:
+            on_grid = ", ".join(f"{key} = {value:.4g}" for key, value in self.best.values.items())
+            values = f"{values} of the material, {on_grid} on this grid"
+        if fit.lowest_friction is not None:
+            values += f", {FRICTION} >= {fit.lowest_friction:.2g} (it may stick)"
         determined = {key: std < self.settings.determined for key, _, std in fit.quantities(self.settings)}
         lists = [
             f"{'determined' if wanted else 'not determined'}: {', '.join(names)}"
@@ -168,3 +214,9 @@ class Identified:
             if (names := [key for key, value in determined.items() if value == wanted])
         ]
         return f"{fit.family.name}{tied}: {values}; {'; '.join(lists)}"
+
+
+def recorded_friction(identified: Mapping[str, Any]) -> float | None:
+    """Coulomb coefficient in the content of identified.json, infinite for a body that may stick. None: it was given."""
+    record = identified.get(FRICTION)
+    return None if record is None else record.get("value", math.inf)

@@ -17,6 +17,13 @@ block jackknife over the image and reported for combinations of constants, becau
 purely plastic flow determines the yield stress but not the stiffness. It is increased on plateaus of the loss, and by
 the disagreement of the last frames or of tied families.
 
+The selected family is fitted on two grids. On the finer one, the images are those of the coarse grid plus a correction,
+which is measured at the fit and again after it, so that only the coarse grid needs derivatives. The constants of the
+material follow by a linear extrapolation to a cell size of zero. Those of the coarse grid predict best on that grid.
+
+The Coulomb coefficient of the body and all its obstacles may be a constant of every family. Where the images also admit
+that the body sticks, the result is a lower bound of the coefficient.
+
 Several videos of one material share the constants, have one initial motion each, and equal weights.
 """
 
@@ -26,7 +33,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from neuma_lib.config.identify import IdentifyConfig
+from neuma_lib.config.identify import FRICTION_NEEDS, IdentifyConfig
 from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError, NonFiniteError
@@ -38,6 +45,9 @@ from neuma_lib.fitting.video_residuals import VideoResiduals
 from neuma_lib.mechanics.combinations import Values
 from neuma_lib.sim.model import MPM
 from neuma_lib.splatting.observation import Observation, joint_frames, several
+
+_CORRECTIONS = 2
+"""How often the correction to the finer discretisation is measured again at the fit to it."""
 
 
 def identify(
@@ -63,13 +73,14 @@ def identify(
             the views of the settings.
         settings: candidates and hyper-parameters.
         published: specification of the law of the scene's prior, an additional start, or None if unknown.
-        refined: for each video, resampled bodies with more particles for the discretisation correction, if any.
+        refined: for each video, resampled bodies with more particles for a finer grid, if any.
         other_videos: initial motion, body and observation of other videos of the same material.
         progress: called with (finished fits, number of fits, mean squared residual).
         log: receives a line for every family.
 
     Raises:
-        InputError: fewer than four frames, none of them after a contact, no family, or one with unknown parts.
+        InputError: fewer than four frames, none of them after a contact, no family, or one with unknown parts, or
+            friction to be fitted without contact of particles.
         NonFiniteError: every family diverges from every start.
     """
     given = [(motion, body, observation), *other_videos]
@@ -82,7 +93,10 @@ def identify(
             "identify.families", "it has no candidates", "Add at least one elasticity with E and nu"
         )
     check_contact(model, ((one.of_body(each), joint_frames(several(video))) for one, each, video in given))
-    families = [Family(name, law.plain()) for name, law in settings.families.items()]
+    fits_friction = settings.contact_friction == "fitted"
+    if fits_friction and model.contact != "particles":
+        raise InputError("identify.contact_friction", *FRICTION_NEEDS)
+    families = [Family(name, law.plain(), fits_friction) for name, law in settings.families.items()]
     families.sort(key=lambda family: len(family.constants))  # simpler families provide starts of the others
     resampled = refined or [()] * len(given)
     videos = [VideoResiduals(model, *one, settings, own) for one, own in zip(given, resampled, strict=True)]
@@ -102,8 +116,8 @@ def identify(
         following = sorted((run for run in running if run.alive), key=lambda run: run.fit.cost)
         if following and level == rounds - 1:
             following[0].measure_discretisation(derivatives=True)
-            for run in following:
-                run.clear_cache()
+            for other in following:
+                other.clear_cache()
         for done, run in enumerate(following):
             run.refine(level)
             if progress:
@@ -117,19 +131,37 @@ def identify(
     selected, ties = _select(list(fits.values()), settings)
     run = next(run for run in running if run.family is selected.family)
     run.measure_discretisation()
-    final = FamilyRun(run.family, videos, [len(video.frames) for video in videos], settings)
     starts, first = [run.values], rounds - 1
     # If the first frames misled, restart at the coarsest level.
     if selected.held_out > settings.prune_factor * selected.loss:
         starts = [run.values, *(run.family.with_guesses(values) for values in ({}, published_values))]
         first = 0
-    final.begin(starts, first, run.deviations)
-    for level in range(first + 1, rounds if final.alive else 0):
-        final.refine(level)
-    best = final.score()
-    if best.covariance is not None:
-        best.covariance = final.inflated_covariance()
-        best.widen_by_ties(selected, [fits[name] for name in ties])
+    counts = [len(video.frames) for video in videos]
+    fine = FamilyRun(run.family, videos, counts, settings)
+    fine.begin(starts, first, run.deviations)
+    for level in range(first + 1, rounds if fine.alive else 0):
+        fine.refine(level)
+    lowest = fine.lowest_friction() if fine.alive else None
+    if lowest is not None:
+        for video in videos:
+            video.set_friction(math.inf)
+        sticking, start = Family(run.family.name, run.family.spec), (fine.values, fine.deviations)
+        fine = FamilyRun(sticking, videos, counts, settings)
+        fine.begin(start[:1], rounds - 1, start[1])
+    tied = [fits[name] for name in ties]
+    if not any(resampled) or not fine.alive:
+        best, material = _final_fit(fine, selected, tied), None
+    else:
+        for _ in range(_CORRECTIONS):
+            fine.measure_discretisation()
+            fine.refine(rounds - 1, closely=True)
+        coarse = FamilyRun(fine.family, videos, counts, settings, corrected=False)
+        coarse.begin([fine.values], rounds - 1, fine.deviations)
+        coarse.refine(rounds - 1, closely=True)
+        best = _final_fit(coarse, selected, tied)
+        material = _final_fit(fine, selected, tied).extrapolated(best, settings.refinement)
+        material.lowest_friction = lowest
+    best.lowest_friction = lowest
     return Identified(
         best,
         ties,
@@ -137,8 +169,19 @@ def identify(
         [video.frames[: video.fitted] for video in videos],
         [video.frames[video.fitted :] for video in videos],
         sum(video.rollouts for video in videos),
+        model.grid,
         settings,
+        material,
     )
+
+
+def _final_fit(run: FamilyRun, selected: FamilyFit, ties: Sequence[FamilyFit]) -> FamilyFit:
+    """The fit of a run to all frames, with an uncertainty that includes plateaus, parts of the video, and ties."""
+    fit = run.score()
+    if fit.covariance is not None:
+        fit.covariance = run.inflated_covariance()
+        fit.widen_by_ties(selected, ties)
+    return fit
 
 
 def _first_fit(

@@ -287,7 +287,8 @@ def from_frame(start: State, loss: TrajectoryLoss, path: Trajectory, first: int)
     """A video from the frame with index ``first`` on, which starts from the state of a path at the previous frame or
     earlier, before all steps of the remaining exposures.
 
-    The steps before a contact do not depend on the law, so they are simulated once and have no gradient.
+    The steps before a contact do not depend on the law, so they are simulated once and have no gradient. With contact
+    of particles that state must not be in contact: the displacement of friction (`Collider`) is not part of it.
     """
     if first == 0:
         return start, loss

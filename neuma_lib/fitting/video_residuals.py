@@ -1,8 +1,9 @@
 """Residuals between simulated and observed images of a launched body, from which constants are identified.
 
 A candidate is a law with deviations of the initial motion and of the position of the rendered body from their
-estimates. The coarse discretisation of a body with few particles changes its apparent material. The difference in the
-images between many and few particles is therefore added to the residuals.
+estimates. A coarse grid and few particles change the apparent material. The difference in the images between a finer
+discretisation and that of the fit can be added to the residuals. The fit then gives the constants of the finer one,
+without its derivatives.
 """
 
 from __future__ import annotations
@@ -42,10 +43,21 @@ class Candidate:
         law: specification of the law.
         deviations: deviations (9,) of velocity and spin from their estimates in standard deviations, then shift right,
             shift down and enlargement of the rendered body in units of the setting ``pose_tolerance``.
+        friction: Coulomb coefficient of all obstacles. None: those of the model.
     """
 
     law: Mapping[str, Mapping[str, Any]]
     deviations: np.ndarray
+    friction: float | None = None
+
+
+@dataclass
+class _Discretisation:
+    """Grid, time step and particles of simulations, and what renders them."""
+
+    model: MPM
+    body: Reconstruction
+    films: list[Filmed]
 
 
 class VideoResiduals:
@@ -61,7 +73,7 @@ class VideoResiduals:
         unsure: indices of the deviations that are not fixed to 0.
         by_deviation: derivatives of the residuals of all frames with respect to these deviations, or None if not
             computed. All families share those of one family, because they are mostly kinematic.
-        spread: difference of the residuals of all frames between two sets of many particles, or None.
+        spread: difference of the residuals of all frames between two sets of refined particles, or None.
         rollouts: number of simulations.
     """
 
@@ -93,13 +105,19 @@ class VideoResiduals:
             for n in self.frames
         ]
 
-        def films(body: Reconstruction) -> list[Filmed]:
-            return [
-                Filmed(body.particle_gs(each.cameras), each, self._steps, settings.compare)
-                for each in observed
-            ]
+        def discretised(by: MPM, body: Reconstruction) -> _Discretisation:
+            films = (body.particle_gs(each.cameras) for each in observed)
+            options = self._steps, settings.compare
+            pairs = zip(films, observed, strict=True)
+            return _Discretisation(by, body, [Filmed(own, each, *options) for own, each in pairs])
 
-        self._body, *self._refined = [(each, films(each)) for each in (body, *refined)]
+        refined_model = replace(
+            model, grid=settings.refinement * model.grid, dt=model.dt / settings.refinement
+        )
+        self._coarse, self._refined = (
+            discretised(model, body),
+            [discretised(refined_model, each) for each in refined],
+        )
         sizes = [
             [max(1, round(each.cameras.width / across)) for across in settings.pyramid] for each in observed
         ]
@@ -111,8 +129,14 @@ class VideoResiduals:
                 averaged(each.colours(part) if settings.compare == "colour" else each.coverage(part), size)
                 for part in frame_batches(len(each.frames), filmed.batch)
             ])
-            for each, filmed, size in zip(observed, self._body[1], self._finest, strict=True)
+            for each, filmed, size in zip(observed, self._coarse.films, self._finest, strict=True)
         ]  # fmt: skip
+
+    def set_friction(self, friction: float) -> None:
+        """Set the Coulomb coefficient of all obstacles in the simulations that follow."""
+        self.model = self.model.with_friction(friction)
+        for each in (self._coarse, *self._refined):
+            each.model = each.model.with_friction(friction)
 
     def counts(self, frames: int) -> list[int]:
         """Number of frames of each observation among the first ``frames`` of all."""
@@ -128,19 +152,20 @@ class VideoResiduals:
     def hold_out(self, family: Family, share: float) -> None:
         """Hold out the last share of the frames after the first contact, whose time is the same for any law."""
         law = family.law_spec(family.values(family.unbounded(family.guess), self.model, self.density))
-        (path,) = self._paths([Candidate(law, np.zeros(NUISANCES))], len(self.frames), self._body[0])
-        vol0 = self._body[0].vol0
+        (path,) = self._paths([Candidate(law, np.zeros(NUISANCES))], len(self.frames), self._coarse)
+        vol0 = self._coarse.body.vol0
         contact = 0 if path is None else first_contact(self.model, path.at(self.frames).x, vol0, self.frames)
         self.fitted = held_out_frames(len(self.frames), share, contact=contact)[0]
 
-    def residuals(self, candidates: Sequence[Candidate], count: int) -> list[list[Tensor] | None]:
-        """Residuals (T, V, H', W', C) of the first ``count`` frames per candidate, None if its rollout diverges."""
-        paths = self._paths(candidates, count, self._body[0])
-        residuals = [
-            self._residual(one, path, self._body[1], count)
-            for one, path in zip(candidates, paths, strict=True)
-        ]
-        if self._correction is None:
+    def residuals(
+        self, candidates: Sequence[Candidate], count: int, corrected: bool = True
+    ) -> list[list[Tensor] | None]:
+        """Residuals (T, V, H', W', C) of the first ``count`` frames per candidate, None if its rollout diverges.
+
+        They are those of the finer discretisation if ``corrected`` and if `measure_correction` has been called.
+        """
+        residuals = self._simulated(candidates, count, self._coarse)
+        if self._correction is None or not corrected:
             return residuals
         return [
             None if one is None else [r + a[: len(r)] for r, a in zip(one, self._correction, strict=True)]
@@ -152,11 +177,11 @@ class VideoResiduals:
         varied = [replace(at, deviations=at.deviations + step) for step in np.eye(NUISANCES)[self.unsure]]
         simulated = [at, *(one for one, k in zip(varied, self.unsure, strict=True) if k < MOTION)]
         count = len(self.frames)
-        paths = self._paths(simulated, count, self._body[0])
+        paths = self._paths(simulated, count, self._coarse)
         # Shift and enlargement of the rendered body need no rollout.
         paths += [paths[0]] * (1 + len(varied) - len(simulated))
         base, *others = (
-            self._residual(one, path, self._body[1], count)
+            self._residual(one, path, self._coarse.films, count)
             for one, path in zip([at, *varied], paths, strict=True)
         )
         if base is not None:  # otherwise it diverges after the fitted frames
@@ -165,30 +190,41 @@ class VideoResiduals:
                 for each in others
             ]
 
-    def refine_particles(self, at: Candidate) -> None:
-        """Set the discretisation correction of all residuals, and its uncertainty, from bodies of more particles."""
+    def measure_correction(self, at: Candidate) -> None:
+        """Set the correction of all residuals to the finer discretisation, and its uncertainty by the particles."""
         if not self._refined:
             return
-        coarse, *fine = (
-            self._residual(at, self._paths([at], len(self.frames), body)[0], filmed, len(self.frames))
-            for body, filmed in (self._body, *self._refined)
-        )
-        fine = [residual for residual in fine if residual is not None]
+        count = len(self.frames)
+        (coarse,), *others = (self._simulated([at], count, each) for each in (self._coarse, *self._refined))
+        fine = [residual for (residual,) in others if residual is not None]
         if coarse is not None and fine:
             means = [torch.stack(of_all).mean(0) for of_all in zip(*fine, strict=True)]
             self._correction = _differences(means, coarse)
             self.spread = _differences(fine[0], fine[-1]) if len(fine) > 1 else None
 
+    def _simulated(
+        self, candidates: Sequence[Candidate], count: int, on: _Discretisation
+    ) -> list[list[Tensor] | None]:
+        """Residuals of the first ``count`` frames in a discretisation, without correction."""
+        paths = self._paths(candidates, count, on)
+        pairs = zip(candidates, paths, strict=True)
+        return [self._residual(one, path, on.films, count) for one, path in pairs]
+
     def _paths(
-        self, candidates: Sequence[Candidate], count: int, body: Reconstruction
+        self, candidates: Sequence[Candidate], count: int, on: _Discretisation
     ) -> list[Trajectory | None]:
-        """Rollouts to the end of the exposure of the first ``count`` frames."""
+        """Rollouts to the end of the exposure of the first ``count`` frames, which are steps of the coarse grid."""
         self.rollouts += len(candidates)
         frames = self._steps[: bisect_right(self._steps, self._last[count - 1])]
-        starts = [self.motion.moved(one.deviations[:MOTION]).of_body(body) for one in candidates]
-        laws = [analytic_law(one.law, self.model.dt).to(starts[0].x.device) for one in candidates]
-        options = dict(steps=frames[-1], frames=frames, total=self._total)
-        return rollout_batch(self.model, laws, starts, **options)
+        starts = [self.motion.moved(one.deviations[:MOTION]).of_body(on.body) for one in candidates]
+        laws = [analytic_law(one.law, on.model.dt).to(starts[0].x.device) for one in candidates]
+        models = [
+            on.model if one.friction is None else on.model.with_friction(one.friction) for one in candidates
+        ]
+        substeps = round(self.model.dt / on.model.dt)
+        options = dict(steps=substeps * frames[-1], frames=[substeps * n for n in frames], total=self._total)
+        paths = rollout_batch(models, laws, starts, **options)
+        return [path and replace(path, frames=tuple(frames)) for path in paths]
 
     @torch.no_grad()
     def _residual(

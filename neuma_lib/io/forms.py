@@ -49,7 +49,8 @@ _FIT = {
 FORMS: dict[str, Any] = {
     "velocity.json": {**_MOTION, "bodies": [_MOTION]},
     "identified.json": {
-        **_FIT, "best": _FIT, "families": {"*": _FIT}, "start": _MOTION, "family": str, "ties": [str]
+        **_FIT, "best": _FIT, "material": _FIT, "families": {"*": _FIT},
+        "start": _MOTION, "grid": int, "family": str, "ties": [str],
     },
     "constants.json": _FIT,
     **dict.fromkeys(("metrics.json", "gaussians.json", "history.json"), {}),

@@ -106,13 +106,14 @@ def _read_law(path: str | Path, dt: float | None, any_time_step: bool) -> Law:
         if EXPORT in metadata:
             dt = fitting_step(checked_export(metadata), dt, any_time_step)
         if ANALYTIC in metadata:
-            return analytic_law(_specification(metadata[ANALYTIC], dt, ANALYTIC))
-        if STRUCTURED in metadata:
+            law = analytic_law(_specification(metadata[ANALYTIC], dt, ANALYTIC))
+        elif STRUCTURED in metadata:
             law = structured_law(_specification(metadata[STRUCTURED], dt), state=state, name=path.stem)
         else:
             law = neural_law(state, name=path.stem)
         if "rank" in metadata:
             _attach(law, state, metadata)
+        law.grid = _grid(metadata.get(EXPORT, metadata))
         return law
     except InputError as error:
         raise located(error, f"prior {path}") from None
@@ -233,9 +234,18 @@ def load_law(
             spec = _specification(metadata[STRUCTURED], dt)
             law = structured_law(spec, state=tensors, name=Path(adaptor).parent.name)
         _attach(law, tensors, metadata)
+        law.grid = _grid(metadata)
     except InputError as error:
         raise located(error, adaptor) from None
     return law
+
+
+def _grid(metadata: Mapping[str, Any]) -> int | None:
+    """Grid that a law was learned on, if the metadata state it."""
+    grid = metadata.get("grid")
+    if grid is not None and not (type(grid) is int and grid > 0):
+        raise InputError("grid", f"{one_line(grid)} in the metadata must be a positive number of cells")
+    return grid
 
 
 def _attach(law: AdaptableLaw, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]) -> None:

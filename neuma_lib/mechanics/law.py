@@ -149,7 +149,14 @@ class Plasticity(Constitutive):
 
 
 class Law(nn.Module):
-    """A material model: elasticity and plasticity, with a name for messages."""
+    """A material model: elasticity and plasticity, with a name for messages.
+
+    Attributes:
+        grid: cells along the unit cube of the simulation that it was learned in, whose discretisation error it has
+            absorbed; None if it does not depend on a grid. Simulations on another grid warn.
+    """
+
+    grid: int | None = None
 
     def __init__(self, elasticity: Elasticity, plasticity: Plasticity, name: str = "law"):
         super().__init__()

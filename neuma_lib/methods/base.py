@@ -348,6 +348,12 @@ def body_of_each_video(case: Case) -> Files:
     return {name: case.each_video(lambda each, file=file: each.result(file)) for name, file in names.items()}
 
 
+def friction_options(case: Case) -> dict[str, Any]:
+    """Options of a model with the identified friction: in other scenes obstacles with a coefficient keep it."""
+    fitted = case.section("identify")["contact_friction"] == "fitted"
+    return {"elsewhere": True} if fitted and case.scene != case.moved else {}
+
+
 def training_inputs(case: Case) -> Files:
     """Body, supervision and initial motion of each video of a scene."""
     supervision = (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from neuma_lib.methods.base import Case, Files, Method, Preset
+from neuma_lib.methods.base import Case, Files, Method, Preset, friction_options
 
 
 class Constants(Method):
@@ -20,12 +20,21 @@ class Constants(Method):
     def model_inputs(self, case: Case) -> Files:
         return {"identified": case.result(case.identified())}
 
+    def model_options(self, case: Case) -> dict:
+        return friction_options(case)
+
     def load(self, inputs, options, dt):
+        from neuma_lib.fitting.identified import recorded_friction
         from neuma_lib.io.files import read_json
         from neuma_lib.mechanics.analytic import analytic_law
         from neuma_lib.methods.model import LawOnGrid
 
-        return LawOnGrid(analytic_law(read_json(inputs["identified"])["law"], dt=dt))
+        identified = read_json(inputs["identified"])
+        law, material = analytic_law(identified["law"], dt=dt), None
+        if "material" in identified:
+            law.grid = identified.get("grid")
+            material = analytic_law(identified["material"]["law"], dt=dt)
+        return LawOnGrid(law, exported=material, friction=recorded_friction(identified), **options)
 
     def uncertainty_inputs(self, case: Case) -> Files:
         return self.model_inputs(case)

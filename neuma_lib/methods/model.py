@@ -18,11 +18,16 @@ class MotionModel(ABC):
 
     Attributes:
         law: the material law that the motion follows from, None if there is none.
+        exported: that law for other simulators, which holds on any grid if it is another object.
         stable: whether the fit ended without divergence.
     """
 
     law: Law | None = None
     stable: bool = True
+
+    @property
+    def exported(self) -> Law | None:
+        return self.law
 
     @abstractmethod
     def predict(
@@ -54,12 +59,29 @@ class LawOnGrid(MotionModel):
         laws: one law a body.
         counts: number of particles of each body. None: one body.
         stable: whether all fits ended without divergence.
+        exported: law of one body for other simulators. None: its law.
+        friction: Coulomb coefficient of the body and its obstacles. None: those of the simulation, as for several
+            bodies together.
+        elsewhere: whether obstacles with a finite coefficient keep it.
     """
 
-    def __init__(self, *laws: Law, counts: Sequence[int] | None = None, stable: bool = True):
+    def __init__(
+        self,
+        *laws: Law,
+        counts: Sequence[int] | None = None,
+        stable: bool = True,
+        exported: Law | None = None,
+        friction: float | None = None,
+        elsewhere: bool = False,
+    ):
         self.law = laws[0]
-        self.stable = stable
+        self.stable, self.friction, self.elsewhere = stable, friction, elsewhere
+        self._exported = exported
         self._laws, self._counts = laws, counts
+
+    @property
+    def exported(self) -> Law:
+        return self._exported or self.law
 
     @classmethod
     def together(cls, models: Sequence[MotionModel], counts: Sequence[int]) -> MotionModel:
@@ -71,6 +93,8 @@ class LawOnGrid(MotionModel):
         )
 
     def predict(self, mpm, state, frames, tracers=None, total=False):
+        if self.friction is not None:
+            mpm = mpm.with_friction(self.friction, given=not self.elsewhere)
         return predict(mpm, self._bodies(state), state, frames, tracers, total)
 
     def courant(self, mpm: MPM, state: State) -> float:

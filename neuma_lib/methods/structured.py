@@ -6,7 +6,7 @@ from neuma_lib.config.motion import WithPrior
 from neuma_lib.config.structured import StructuredConfig
 from neuma_lib.config.training import TrainingConfig
 from neuma_lib.errors import InputError
-from neuma_lib.methods.base import Case, Files, Method, Preset, training_inputs
+from neuma_lib.methods.base import Case, Files, Method, Preset, friction_options, training_inputs
 
 IDENTIFIED = "identified"
 
@@ -50,10 +50,15 @@ class Structured(Method):
     def model_inputs(self, case: Case) -> Files:
         return {"adaptor": case.product()}
 
+    def model_options(self, case: Case) -> dict:
+        return friction_options(case) if case.prior == IDENTIFIED else {}
+
     def seeds(self, case: Case) -> tuple[str, ...]:
         return (*super().seeds(case), "adaptor")  # of the first layers
 
     def fit(self, inputs, options, problem, run):
+        from neuma_lib.fitting.families import FRICTION
+        from neuma_lib.fitting.identified import recorded_friction
         from neuma_lib.fitting.structured_fit import rival_bases, train_structured
         from neuma_lib.io.files import read_json
         from neuma_lib.io.laws import save_adaptor
@@ -63,7 +68,7 @@ class Structured(Method):
         options = dict(options)
         base = options.pop("base")
         settings = StructuredOptions(**options)
-        bases = [base]
+        bases, identified = [base], {}
         if not base:
             identified = read_json(inputs["identified"])
             bases = [identified["law"], *rival_bases(identified, settings.rivals)]
@@ -74,23 +79,31 @@ class Structured(Method):
         laws = [law.to(run.device) for law in laws]
         for law in laws:
             law.attach_adaptor(settings.rank, settings.alpha, settings.seed)
-        training = Training(inputs, options, settings, problem, run, {"base": base})
+        friction = recorded_friction(identified)
+        training = Training(inputs, options, settings, problem, run, {"base": base}, friction)
         trained, chosen = train_structured(
             *training.problem(laws[0]), settings, rivals=laws[1:], **training.options()
         )
         run.log(chosen.summary())
         training.write_history(trained, chosen.as_dict())
-        about = {"settings": options, **training.report(trained)}
+        about = {
+            "settings": options,
+            "grid": problem.simulation["grid"],
+            **training.report(trained),
+        }
+        about |= {FRICTION: identified[FRICTION]} if friction is not None else {}
         save_adaptor(run.product, trained.law, settings.rank, settings.alpha, about)
         training.finish(trained)
 
     def load(self, inputs, options, dt):
+        from neuma_lib.fitting.identified import recorded_friction
         from neuma_lib.io.laws import load_law
         from neuma_lib.io.weights import read_weights
         from neuma_lib.methods.model import LawOnGrid
 
-        stable = read_weights(inputs["adaptor"])[1]["stable"]
-        return LawOnGrid(load_law(None, inputs["adaptor"], dt), stable=stable)
+        about = read_weights(inputs["adaptor"])[1]
+        law, friction = load_law(None, inputs["adaptor"], dt), recorded_friction(about)
+        return LawOnGrid(law, stable=about["stable"], friction=friction, **options)
 
     def uncertainty_inputs(self, case: Case) -> Files:
         if case.prior != IDENTIFIED:

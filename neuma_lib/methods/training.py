@@ -30,6 +30,7 @@ class Training:
         options: as the method got them.
         settings: the same, validated.
         stamp: additional settings that a checkpoint must agree with.
+        friction: Coulomb coefficient of all obstacles. None: those of the problem.
     """
 
     def __init__(
@@ -40,8 +41,11 @@ class Training:
         problem: Problem,
         run: FitRun,
         stamp: Mapping[str, Any] | None = None,
+        friction: float | None = None,
     ):
         self.settings, self.run, self._problem = settings, run, problem
+        mpm = simulator(problem.simulation)
+        self._mpm = mpm if friction is None else mpm.with_friction(friction)
         parts = zip(*(listed(inputs[name]) for name in ("particles", "binding", "gaussians")), strict=True)
         bodies = [
             load_reconstruction(*files, density, settings.particle_source, settings.gaussian_motion).to(
@@ -60,7 +64,7 @@ class Training:
                 for body, file in zip(bodies, listed(inputs["transforms"]), strict=True)
             ]
         frames = [loss.frames for loss in self.losses]
-        check_contact(simulator(problem.simulation), zip(self.starts, frames, strict=True))
+        check_contact(self._mpm, zip(self.starts, frames, strict=True))
         files = {
             f"{name} {k}": file for name, value in inputs.items() for k, file in enumerate(listed(value))
         }
@@ -78,7 +82,7 @@ class Training:
 
     def problem(self, law: AdaptableLaw) -> tuple:
         """Positional arguments of `train_material`."""
-        return simulator(self._problem.simulation), law, self.starts[0], self.losses[0], self.settings
+        return self._mpm, law, self.starts[0], self.losses[0], self.settings
 
     def options(self) -> dict[str, Any]:
         """Keyword arguments of `train_material`."""

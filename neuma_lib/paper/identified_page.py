@@ -21,6 +21,8 @@ _WIDEST = 1.5  # maximum length of an error bar to either side, in decades
 def identified_page(identified: Mapping[str, Any], truth: Mapping[str, Mapping[str, Any]] | None) -> Figure:
     """Draw the held-out loss of each evaluated family, and the best one's constants relative to their values.
 
+    They are those of the material, or of the grid if there is no second one.
+
     Error bars are two standard deviations, crosses are the truth.
 
     Args:
@@ -43,7 +45,7 @@ def identified_page(identified: Mapping[str, Any], truth: Mapping[str, Mapping[s
     losses.set(xscale="log", xlabel="mean squared residual of held-out frames", title=title)
     losses.xaxis.set_minor_formatter(NullFormatter())
 
-    quantities = identified["best"]["quantities"]
+    quantities = identified.get("material", identified["best"])["quantities"]
     true = true_values(truth or {})
     for place, (name, entry) in enumerate(reversed(quantities.items())):
         std = min(_BARS * entry["log_std"], _WIDEST * math.log(10))
@@ -63,5 +65,7 @@ def identified_page(identified: Mapping[str, Any], truth: Mapping[str, Mapping[s
     constants.xaxis.set_minor_formatter(NullFormatter())
     constants.axvline(1, color=style.LIGHT, zorder=0)
     tied = f", tie with {', '.join(identified['ties'])}" if identified["ties"] else ""
-    constants.set_title(identified["family"] + tied)
+    lowest = identified.get("contact_friction", {}).get("at_least")
+    friction = "" if lowest is None else f", contact_friction at least {lowest:.2g}"
+    constants.set_title(identified["family"] + tied + friction)
     return figure

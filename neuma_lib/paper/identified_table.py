@@ -19,14 +19,18 @@ CLOSE = 10.0
 SHARE = Fraction(4, 5)
 """Claimed share of right families, of errors within `WITHIN` and of errors within `CLOSE`."""
 RIGHT, TIE, WRONG = "right", "tie", "wrong"
+MATERIAL, GRID = "of the material", "on the grid"
+FITS = {MATERIAL: "material", GRID: "best"}
+"""Entries of identified.json with constants extrapolated to a cell size of zero, and with those of the fit's grid."""
 COLUMNS = "quantity value truth error_percent log_std error_in_std determined".split()
 """Columns of a quantity in the CSV."""
 
 RULE = (
     "A family is right if it is the one that the truth was simulated with, or ties with it. Constants, moduli and "
-    "ratios of the identified family count that the truth has too. *Determined* are those with an estimated standard "
-    "deviation below `identify.determined`. A claim *holds* if the count is reached, else it *does not hold*. Several "
-    "replicates of a scene are not independent."
+    "ratios of the identified family count that the truth has too. A converged truth is compared with the constants of "
+    "the material, another one with those on the grid that it shares with the fit. *Determined* are those with an "
+    "estimated standard deviation below `identify.determined`. A claim *holds* if the count is reached, else it *does "
+    "not hold*. Several replicates of a scene are not independent."
 )
 """Explanation of the verdicts for readers of the table."""
 
@@ -52,15 +56,18 @@ def compare_family(identified: Mapping[str, Any], truth: Mapping[str, Mapping[st
     )
 
 
-def compare_quantities(identified: Mapping[str, Any], truth: Mapping[str, Mapping[str, Any]]) -> list[dict]:
+def compare_quantities(
+    identified: Mapping[str, Any], truth: Mapping[str, Mapping[str, Any]], of: str = GRID
+) -> list[dict]:
     """Quantities that the true law has too, as `COLUMNS`. Values are in SI units and degrees, stds of logarithms.
 
     Args:
         identified: content of identified.json.
         truth: specification of the true law.
+        of: one of `FITS`.
     """
     true, rows = true_values(truth), []
-    for name, entry in identified["best"]["quantities"].items():
+    for name, entry in identified.get(FITS[of], {}).get("quantities", {}).items():
         value, right, std = entry["value"], true.get(name, 0), entry["log_std"]
         if right > 0 and value > 0:
             ratio = value / right
@@ -73,8 +80,9 @@ def identified_table(scenes: Sequence[Mapping[str, Any]]) -> tuple[str, str]:
     """CSV with a row for each quantity, and Markdown with a row for each scene and verdicts for each group.
 
     Args:
-        scenes: ``name``, ``group`` of the scenes that claims count together, ``identified``, the content of
-            identified.json, and ``truth``, the specification of the true law, for each scene and replicate.
+        scenes: ``name``, ``group`` of the scenes that claims count together, ``converged``, whether the truth is,
+            ``identified``, the content of identified.json, and ``truth``, the specification of the true law, for each
+            scene and replicate.
 
     Raises:
         InputError: there are no scenes.
@@ -86,12 +94,14 @@ def identified_table(scenes: Sequence[Mapping[str, Any]]) -> tuple[str, str]:
     rows, groups = [], {}
     for scene in scenes:
         identified, laws = scene["identified"], (scene["identified"], scene["truth"])
-        verdict, quantities = compare_family(*laws), compare_quantities(*laws)
-        rows += [[scene["name"], identified["family"], verdict, *row.values()] for row in quantities]
+        verdict, quantities = compare_family(*laws), {of: compare_quantities(*laws, of) for of in FITS}
+        for of, compared in quantities.items():
+            rows += [[scene["name"], identified["family"], verdict, of, *row.values()] for row in compared]
         tied = f", as good: {', '.join(identified['ties'])}" if identified["ties"] else ""
-        listed = [_listed(quantities, determined) for determined in (True, False)]
+        counted_of = MATERIAL if scene["converged"] else GRID
+        listed = [_listed(quantities[of], True) for of in FITS] + [_listed(quantities[counted_of], False)]
         cells = [scene["name"], f"{identified['family']} ({verdict}{tied})", *listed]
-        groups.setdefault(scene["group"], []).append((cells, verdict, quantities))
+        groups.setdefault(scene["group"], []).append((cells, verdict, quantities[counted_of]))
     text = [
         "# Identified materials",
         "",
@@ -100,13 +110,13 @@ def identified_table(scenes: Sequence[Mapping[str, Any]]) -> tuple[str, str]:
     verdicts = []
     for group, members in groups.items():
         lines, families, quantities = zip(*members)
-        heads = ["scene", "family", "determined", "not determined"]
+        heads = ["scene", "family", *(f"determined, {of}" for of in FITS), "not determined"]
         text += ["", f"**{group}**", "", *as_markdown(heads, lines)]
         verdicts += _verdicts(
             group, families, [row for rows in quantities for row in rows if row["determined"]]
         )
     text += ["", *verdict_lines(verdicts), RULE, ""]
-    return as_csv([["scene", "family", "family_is", *COLUMNS], *rows]), "\n".join(text)
+    return as_csv([["scene", "family", "family_is", "constants", *COLUMNS], *rows]), "\n".join(text)
 
 
 def _kind(spec: Mapping[str, Mapping[str, Any]]) -> tuple[str, str, bool]:

@@ -9,6 +9,7 @@ from functools import partial, reduce
 from pathlib import Path
 
 from neuma_lib.config.figures import FiguresConfig
+from neuma_lib.config.identify import FRICTION_NEEDS
 from neuma_lib.config.validation import hint, joined, validate
 from neuma_lib.config.variants import name_problem
 from neuma_lib.errors import InputError
@@ -45,6 +46,8 @@ def check_consistency(settings: Config, root: str | Path = ".") -> None:
 def _section_errors(settings: Config, root: str | Path) -> Iterator[InputError]:
     yield from _name_errors(settings)
     yield from _folder_errors(settings, root)
+    if settings.identify.contact_friction == "fitted" and settings.simulation.contact != "particles":
+        yield InputError("identify.contact_friction", *FRICTION_NEEDS)
     for name in settings.scenes:
         yield from _scene_errors(settings, name)
     for name in settings.methods:

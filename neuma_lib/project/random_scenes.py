@@ -288,7 +288,7 @@ def _flaw(settings: RandomConfig, scene: Mapping[str, Any], gravity: Vector) -> 
     Before contact the body falls and rotates. It is inside its bounding box and about fills the ellipsoid in that box,
     so it touches the ground no earlier than the rotating box, and not much later than the ellipsoid.
 
-    Walls are at 0 and 1, so that scenes do not depend on the grid, although contact begins half a cell earlier
+    Walls are at 0 and 1, so that scenes do not depend on the grid. Contact of nodes begins half a cell earlier
     (`MPM.contact`; 0.021 m on 24 cells). A test moves the meshes of many scenes and confirms that no body touches a
     wall at the start, or another wall before the ground, and that at least five frames precede contact.
     """

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, Literal
 
 from pydantic import Field
@@ -12,7 +13,7 @@ from pydantic import Field
 from neuma_lib.config.base import Section, Seed
 from neuma_lib.config.binding import BindingConfig
 from neuma_lib.config.capture import CapturesConfig
-from neuma_lib.config.dataset import DatasetConfig, TruthConfig
+from neuma_lib.config.dataset import CONVERGED, CONVERGED_CELLS, DatasetConfig, TruthConfig
 from neuma_lib.config.demo import DemoConfig
 from neuma_lib.config.evaluation import EvaluationConfig
 from neuma_lib.config.experiments import ExperimentConfig
@@ -172,15 +173,24 @@ class Config(Section):
         return f"scenes.{base}.colliders", self.scenes[base].colliders
 
     def scene_truth(self, name: str) -> TruthConfig:
-        """Resolution of the ground truth of a scene, without null values."""
+        """Resolution of the ground truth of a scene. Only the particles of a converged truth may be null."""
         scene = self.scene(name)
         return self._truth(scene.truth, scene.dt, f"scenes.{name}")
 
     def experiment_truth(self, name: str) -> TruthConfig:
-        """Resolution of the ground truth of an experiment."""
-        return self._truth(TruthConfig(), self.experiment_dt(name), f"experiments.{name}")
+        """Resolution of the ground truth of an experiment, converged if that of a scene of its bodies is."""
+        scenes = [self.scene(body.scene) for body in self.experiment(name).bodies]
+        converged = any(scene.truth.grid == CONVERGED for scene in scenes)
+        own = TruthConfig(grid=CONVERGED if converged else None)
+        return self._truth(own, self.experiment_dt(name), f"experiments.{name}")
 
     def _truth(self, own: TruthConfig, dt: float, origin: str) -> TruthConfig:
+        grid = own.grid or self.dataset.grid or self.simulation.grid
+        if grid == CONVERGED:
+            factor = 2 * math.ceil(CONVERGED_CELLS / (2 * self.simulation.grid))
+            return TruthConfig(
+                grid=factor * self.simulation.grid, dt=own.dt or dt / factor, particles=own.particles
+            )
         step = own.dt or self.dataset.dt or dt
         substeps = round(dt / step)
         if substeps < 1 or abs(dt / step - substeps) > 1e-6 * substeps:
@@ -189,7 +199,7 @@ class Config(Section):
                 key, f"{step:g} s is not an integer fraction of the time step {dt:g} s of {origin}"
             )
         return TruthConfig(
-            grid=own.grid or self.dataset.grid or self.simulation.grid,
+            grid=grid,
             dt=step,
             particles=own.particles or self.dataset.particles,
         )

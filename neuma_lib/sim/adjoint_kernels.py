@@ -34,6 +34,7 @@ def adjoint_kernels(
     real, vec3, vec4, mat33, mat34, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.mat34, t.GridConstants
     stencil, slopes, moments = functions.stencil, functions.slopes, functions.moments
     column, wall_mask, moved_mask = functions.column, functions.wall_mask, functions.moved_mask
+    obstacle_row = functions.obstacle_row
     gather, three_nodes = gather_functions(dtype)
     module = f"neuma_lib.sim.adjoint_{str(dtype).removeprefix('torch.')}_{'_'.join((scatter, *features))}"
     kernel = functools.partial(wp.kernel, enable_backward=False, module=module)
@@ -171,8 +172,9 @@ def adjoint_kernels(
         A = c.dx * (m * C[now, p] - stress * tau[cached, p])
         v_p = v[now, p]
         if wp.static(contact):
+            row_p = obstacle_row(c, p, pose)
             v_p, _stuck, touches = touch(
-                obstacles, distances, pose, c.faces, c.dt, x[now, p], v_p, stuck[now, p], r
+                obstacles, distances, row_p, c.faces, c.dt, x[now, p], v_p, stuck[now, p], r
             )
         q0 = m * v_p - A * f
         q_i = vec4(q0[0], q0[1], q0[2], m)
@@ -198,7 +200,7 @@ def adjoint_kernels(
                 g_x, g_v_before, g_s = touch_adjoint(
                     obstacles,
                     distances,
-                    pose,
+                    row_p,
                     c.faces,
                     c.dt,
                     x[now, p],

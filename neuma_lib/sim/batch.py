@@ -19,7 +19,7 @@ TOGETHER = {"cpu": 8, "cuda": 64}
 
 @torch.no_grad()
 def rollout_batch(
-    model: MPM,
+    model: MPM | Sequence[MPM],
     laws: Sequence[Law],
     start: State | Sequence[State],
     *,
@@ -35,7 +35,7 @@ def rollout_batch(
     share only the transfers.
 
     Args:
-        model: as in `rollout`.
+        model: as in `rollout`, one for all laws or one per law. They may differ in friction.
         laws: B laws, each for all particles.
         start: N particles, one initial state for all laws or one per law.
         steps, frames, total: as in `rollout`.
@@ -46,7 +46,8 @@ def rollout_batch(
         The trajectory of each law, or None where it diverged.
 
     Raises:
-        InputError: as `rollout`, or the numbers of laws, initial states or their particles do not match.
+        InputError: as `rollout`, or the numbers of laws, models, initial states or their particles do not match, or
+            the models differ in more than friction.
     """
     frames = checked_frames(frames, steps)
     starts = [start] * len(laws) if isinstance(start, State) else list(start)
@@ -56,6 +57,14 @@ def rollout_batch(
             f"{len(laws)} laws do not match initial states of {[len(state.x) for state in starts]} particles",
             "Give one state for all laws or one per law, with equal numbers of particles",
         )
+    models = [model] * len(laws) if isinstance(model, MPM) else list(model)
+    model = models[0]
+    if len(models) != len(laws) or any(own.frictionless != model.frictionless for own in models):
+        raise InputError(
+            "model",
+            f"{len(models)} models for {len(laws)} laws must be equal up to friction",
+            "Give one for all",
+        )
     for state in {id(state): state for state in starts}.values():
         check_inside(model, state.x)
     result: list[Trajectory | None] = [None] * len(laws)
@@ -63,7 +72,8 @@ def rollout_batch(
     together = together or TOGETHER[starts[0].x.device.type]
     for copies in (order[i : i + together] for i in range(0, len(laws), together)):
         own = [laws[copy] for copy in copies], [starts[copy] for copy in copies]
-        paths = _side_by_side(model, *own, frames, total, skip_free_flight)
+        frictions = [models[copy].frictions for copy in copies]
+        paths = _side_by_side(model, *own, frames, total, skip_free_flight, frictions)
         for copy, path in zip(copies, paths, strict=True):
             result[copy] = path
     return result
@@ -76,6 +86,7 @@ def _side_by_side(
     frames: tuple[int, ...],
     total: bool,
     skip_free_flight: bool,
+    frictions: Sequence[Sequence[float]],
 ) -> list[Trajectory | None]:
     """Simulate laws in the same launches, those with fused kernels first."""
     N, copies = len(starts[0].x), len(laws)
@@ -88,7 +99,7 @@ def _side_by_side(
     state = State.joined(starts) if copies > 1 else starts[0]
     try:
         path, errors = fly_and_simulate(
-            model, tuple(regions), state, frames, None, total, skip_free_flight, copies
+            model, tuple(regions), state, frames, None, total, skip_free_flight, copies, frictions=frictions
         )
     except NonFiniteError:
         return [None] * copies

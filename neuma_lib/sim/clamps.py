@@ -13,7 +13,7 @@ from neuma_lib.errors import InputError
 from neuma_lib.sim.motion import Motion, Vector, vector
 
 HELD_SHARE = 0.05
-"""Share of clamped mass from which on a node is held. In a uniform body these are the nodes up to 0.83 cells beyond the
+"""Share of clamped mass above which a node is held. In a uniform body these are the nodes up to 0.83 cells beyond the
 end of a clamp, where a quadratic B-spline has this share on the other side. Depending on where nodes are, the body then
 moves as if the clamp ended up to 0.7 cells nearer or farther. With a larger share, too small a part of the weights at
 the end of a clamp can be at held nodes: at 1 / 6 a layer of the body is up to 2 cells too long."""
@@ -24,10 +24,11 @@ class Clamp(Motion):
     """Particles that start in a box follow a rigid motion until they are released.
 
     Clamped particles are not part of the material: they add neither mass nor stress to the grid. A node whose mass is
-    clamped by a share of `HELD_SHARE` or more moves with the clamp instead, which holds the neighbouring particles like
-    a rigid wall, without the creep of a force that each step has to build up again. Clamped particles move exactly with
-    the clamp, and their deformation turns with it, so that a release continues without a jump. A particle in several
-    clamps follows the first.
+    clamped by a share of more than `HELD_SHARE` moves with the clamp instead. So the clamp is rigid, and a load does
+    not creep: if clamped particles only had prescribed velocities, a node between them and the body would move by
+    dt^2 f / m in each step under a constant force f. Clamped particles move exactly with the clamp, and their
+    deformation turns with it, so that a release continues without a jump. A particle in several clamps follows the
+    first.
 
     Attributes:
         lowest, highest: corners of the box at t = 0 [m].

@@ -60,6 +60,7 @@ def warp_types(dtype: torch.dtype) -> SimpleNamespace:
     class GridConstants:
         n: wp.int32  # nodes along an edge
         particles: wp.int32  # per copy
+        copies: wp.int32
         wall_nodes: wp.int32  # thickness of a wall
         faces: wp.int32  # first obstacles that are faces of the unit cube
         walls: types.walls  # condition on x_min, x_max, y_min, y_max, z_min, z_max
@@ -95,6 +96,11 @@ def grid_functions(dtype: torch.dtype) -> SimpleNamespace:
         if p >= c.particles:  # avoids the division for a single copy
             copy = p / c.particles
         return copy
+
+    @wp.func
+    def obstacle_row(c: GridConstants, p: wp.int32, pose: wp.int32):
+        """Row of the obstacles of particle p, which copies have with their own friction."""
+        return pose * c.copies + copy_of(c, p)
 
     @wp.func
     def weights(f: real):
@@ -167,6 +173,7 @@ def grid_functions(dtype: torch.dtype) -> SimpleNamespace:
 
     return SimpleNamespace(
         copy_of=copy_of,
+        obstacle_row=obstacle_row,
         stencil=stencil,
         slopes=slopes,
         moments=moments,
@@ -192,6 +199,7 @@ def forward_kernels(
     real, vec3, vec4, mat33, mat34, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.mat34, t.GridConstants
     copy_of, stencil, moments = functions.copy_of, functions.stencil, functions.moments
     column, wall_mask, moved = functions.column, functions.wall_mask, functions.moved
+    obstacle_row = functions.obstacle_row
     gather, _ = gather_functions(dtype)
     module = f"neuma_lib.sim.forward_{str(dtype).removeprefix('torch.')}_{'_'.join((scatter, *features))}"
     kernel = functools.partial(wp.kernel, enable_backward=False, module=module)
@@ -255,8 +263,9 @@ def forward_kernels(
         A = c.dx * (m * C[now, p] - (real(4.0) * c.dt * c.inv_dx * c.inv_dx * vol) * tau[cached, p])
         v_p = v[now, p]
         if wp.static(contact):
+            row_p = obstacle_row(c, p, pose)
             v_p, stuck_p, _touches = touch(
-                obstacles, distances, pose, c.faces, c.dt, x[now, p], v_p, stuck[now, p], r
+                obstacles, distances, row_p, c.faces, c.dt, x[now, p], v_p, stuck[now, p], r
             )
             stuck[after, p] = stuck_p
         # q = (m v + A d, m) grows by a column of A from node to node

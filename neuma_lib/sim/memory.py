@@ -12,6 +12,7 @@ DEFAULT_CACHE_BYTES = {"cpu": 1 << 29, "cuda": 1 << 32}
 
 _STATE_FLOATS = 24  # x, v, C, F of a particle
 _TOTAL_FLOATS = 9  # F_total of a particle
+_CONTACT_FLOATS = 3  # tangential displacement of a particle in contact
 _STEP_FLOATS = 18  # tau, F_trial of a particle
 _NODE_FLOATS = 8  # grid, grid_v of a node
 
@@ -40,6 +41,7 @@ def plan_memory(
     cache_bytes: float,
     memory: float | None = None,
     total: bool = False,
+    contact: bool = False,
 ) -> MemoryPlan:
     """The fastest plan that fits into memory.
 
@@ -49,11 +51,12 @@ def plan_memory(
         cache_bytes: maximum bytes for intermediate values if all states fit; 0 always recomputes them.
         memory: maximum bytes for states and intermediate values together; None does not limit the states.
         total: whether states include the total deformation.
+        contact: whether states include the tangential displacement of contact of particles.
 
     Raises:
         InputError: segments of a single step do not fit into `memory`.
     """
-    state = itemsize * (_STATE_FLOATS + total * _TOTAL_FLOATS) * particles
+    state = itemsize * (_STATE_FLOATS + total * _TOTAL_FLOATS + contact * _CONTACT_FLOATS) * particles
     step = itemsize * (_STEP_FLOATS * particles + _NODE_FLOATS * nodes)
     whole = state * (steps + 1) + step
     if memory is None or whole <= memory:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import accumulate
 
 import torch
@@ -19,7 +19,10 @@ from neuma_lib.sim.colliders import Collider, contact_radius, unit_cube
 WALLS = ("x_min", "x_max", "y_min", "y_max", "z_min", "z_max")
 CONDITIONS = ("no_slip", "slip", "sticky")
 CONTACTS = ("particles", "nodes", "released")
+Condition = str | float
+"""Condition of a wall: one of `CONDITIONS`, or a Coulomb coefficient."""
 _FRICTION = {"no_slip": math.inf, "slip": 0.0}
+_NAMED = {friction: name for name, friction in _FRICTION.items()}
 _OUTSIDE = 2
 """Nodes outside the cube at either end of an axis, wall nodes if ``contact`` is "nodes"."""
 
@@ -48,8 +51,8 @@ class MPM:
         gravity: acceleration [m/s^2], y is up.
         boundary: boundary condition, one name for all walls or one per wall (keys `WALLS`, default "no_slip").
             "no_slip" stops a wall node whose velocity points into the wall, "slip" removes only the component that
-            points into the wall, "sticky" always stops wall nodes. For contact of particles, "no_slip" is infinite
-            friction and "slip" is none; "sticky" is not available.
+            points into the wall, "sticky" always stops wall nodes. For contact of particles it is a Coulomb
+            coefficient: a number, or "no_slip" for infinity and "slip" for 0.
         contact: one of `CONTACTS`.
         wall_cells: thickness of released walls [nodes].
         colliders: obstacles in the cube, for contact of particles only.
@@ -62,8 +65,8 @@ class MPM:
     grid: int
     dt: float
     gravity: tuple[float, float, float] = (0.0, -9.8, 0.0)
-    boundary: str | Mapping[str, str] | tuple[str, ...] = "no_slip"
-    contact: str = "nodes"
+    boundary: Condition | Mapping[str, Condition] | tuple[Condition, ...] = "no_slip"
+    contact: str = "particles"
     wall_cells: int = 1
     colliders: tuple[Collider, ...] = ()
     clamps: tuple[Clamp, ...] = ()
@@ -83,20 +86,46 @@ class MPM:
             limits = f"1 to {largest} for contact of {self.contact} and {self.grid} cells"
             raise InputError("wall_cells", f"{self.wall_cells!r} must be an integer from {limits}")
         object.__setattr__(self, "gravity", gravity)
-        object.__setattr__(self, "boundary", _six_conditions(self.boundary))
+        object.__setattr__(self, "boundary", _six_conditions(self.boundary, self.contact))
         object.__setattr__(self, "colliders", tuple(self.colliders))
         object.__setattr__(self, "clamps", tuple(self.clamps))
         if self.contact != "particles" and self.colliders:
             raise InputError("colliders", f"need contact of particles, not of {self.contact}")
-        if self.contact == "particles" and "sticky" in self.boundary:
-            raise InputError("boundary", "'sticky' needs contact of nodes", "Use no_slip or slip")
 
     @property
     def obstacles(self) -> tuple[Collider, ...]:
         """Colliders of contact of particles: the six faces of the cube in the order of `WALLS`, then the others."""
         if self.contact != "particles":
             return ()
-        return (*unit_cube([_FRICTION[condition] for condition in self.boundary]), *self.colliders)
+        conditions = _six_conditions(self.boundary, self.contact)
+        frictions = [_FRICTION[own] if isinstance(own, str) else own for own in conditions]
+        return (*unit_cube(frictions), *self.colliders)
+
+    @property
+    def frictions(self) -> tuple[float, ...]:
+        """Coulomb coefficients of the obstacles."""
+        return tuple(obstacle.friction for obstacle in self.obstacles)
+
+    @property
+    def frictionless(self) -> MPM:
+        """The same model for all models that differ only in `frictions`."""
+        return self.with_friction(0.0) if self.contact == "particles" else self
+
+    def with_friction(self, friction: float, given: bool = True) -> MPM:
+        """This model with a Coulomb coefficient of all obstacles, or only of those that stick if not ``given``.
+
+        Raises:
+            InputError: contact is not of particles.
+        """
+        if self.contact != "particles":
+            raise InputError("friction", f"needs contact of particles, not of {self.contact}")
+        changed = [friction if given or own == math.inf else own for own in self.frictions]
+        colliders = zip(self.colliders, changed[len(WALLS) :], strict=True)
+        return replace(
+            self,
+            boundary=tuple(changed[: len(WALLS)]),
+            colliders=tuple(replace(collider, friction=own) for collider, own in colliders),
+        )
 
     @property
     def dx(self) -> float:
@@ -228,9 +257,11 @@ def contact_clearance(model: MPM, x: Tensor, vol0: Tensor, steps: Sequence[int] 
     return (nearest - contact_radius(vol0)).amin(dim=-1)
 
 
-def _six_conditions(boundary: str | Mapping[str, str] | Sequence[str]) -> tuple[str, ...]:
-    """Condition of each wall in the order of `WALLS`."""
-    if isinstance(boundary, str):
+def _six_conditions(
+    boundary: Condition | Mapping[str, Condition] | Sequence[Condition], contact: str
+) -> tuple[Condition, ...]:
+    """Condition of each wall in the order of `WALLS`. Coefficients that have a name are named."""
+    if isinstance(boundary, str) or not isinstance(boundary, Iterable):
         conditions = (boundary,) * 6
     elif isinstance(boundary, Mapping):
         unknown = sorted(set(boundary) - set(WALLS))
@@ -243,7 +274,28 @@ def _six_conditions(boundary: str | Mapping[str, str] | Sequence[str]) -> tuple[
             raise InputError(
                 "boundary", f"{len(conditions)} conditions must be one per wall: {', '.join(WALLS)}"
             )
-    for condition in conditions:
+    return tuple(_condition(condition, contact) for condition in conditions)
+
+
+def _condition(condition: Condition, contact: str) -> Condition:
+    """A valid condition for the kind of contact."""
+    if isinstance(condition, str):
         if condition not in CONDITIONS:
-            raise InputError("boundary", f"{condition!r} must be one of {', '.join(CONDITIONS)}")
-    return conditions
+            raise InputError(
+                "boundary", f"{condition!r} must be one of {', '.join(CONDITIONS)}, or a Coulomb coefficient"
+            )
+        if condition == "sticky" and contact == "particles":
+            raise InputError(
+                "boundary", "'sticky' needs contact of nodes", "Use no_slip, slip or a Coulomb coefficient"
+            )
+        return condition
+    if isinstance(condition, bool) or not (isinstance(condition, (int, float)) and condition >= 0):
+        raise InputError("boundary", f"the Coulomb coefficient {condition!r} must be a number of at least 0")
+    if contact != "particles":
+        remedy = f"Use {', '.join(CONDITIONS)}, or contact of particles"
+        raise InputError(
+            "boundary",
+            f"the Coulomb coefficient {condition:g} needs contact of particles, not of {contact}",
+            remedy,
+        )
+    return _NAMED.get(condition, float(condition))

@@ -6,7 +6,9 @@ gradient is one reverse loop over the stored states. The total deformation is an
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -19,6 +21,8 @@ from neuma_lib.sim.memory import DEFAULT_CACHE_BYTES, plan_memory
 from neuma_lib.sim.model import MPM, MaterialRegion, as_regions
 from neuma_lib.sim.simulation import Simulation, gather_weights
 from neuma_lib.sim.state import State, Trajectory
+
+_LOGGER = logging.getLogger(__name__)
 
 
 def rollout(
@@ -70,10 +74,25 @@ def rollout(
         given = f"shape {tuple(tracers.shape)} as {tracers.dtype}"
         raise InputError("tracers", f"{given} must be (M, 3) as {state.x.dtype}")
 
+    for region in regions:
+        if region.law.grid not in (None, model.grid):
+            _warn_of_another_grid(region.law.name, region.law.grid, model.grid)
     path, _ = fly_and_simulate(
         model, regions, state, frames, tracers, total, skip_free_flight, 1, scatter, memory, cache_bytes
     )
     return path
+
+
+@cache
+def _warn_of_another_grid(name: str, learned: int, used: int) -> None:
+    """Warn once that a law is used on another grid than the one whose discretisation error it has absorbed."""
+    _LOGGER.warning(
+        "law %r was learned on a grid of %d cells along the cube and is used on one of %d: its motion there differs by "
+        "the discretisation error that it has absorbed",
+        name,
+        learned,
+        used,
+    )
 
 
 def simulate(
@@ -127,8 +146,10 @@ def fly_and_simulate(
     scatter: str | None = None,
     memory: float | None = None,
     cache_bytes: float | None = None,
+    frictions: Sequence[Sequence[float]] | None = None,
 ) -> tuple[Trajectory, list[NonFiniteError | None]]:
-    """`rollout` with checked arguments, for a state of several ``copies`` with equal numbers of particles.
+    """`rollout` with checked arguments, for a state of several ``copies`` with equal numbers of particles, and their
+    `MPM.frictions` if they differ.
 
     Returns one error per copy, or None. The states of a copy with an error are undefined. If all copies have one, the
     first is raised.
@@ -149,9 +170,11 @@ def fly_and_simulate(
     inputs = (*start, *weights)
     if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
         cache_bytes = DEFAULT_CACHE_BYTES[x.device.type] if cache_bytes is None else cache_bytes
-        nodes = copies * model.nodes**3
-        plan = plan_memory(steps, len(x), nodes, x.element_size(), cache_bytes, memory, total)
-    simulation = Simulation(model, regions, slices, state, steps, first, plan, scatter, total, copies)
+        nodes, contact = copies * model.nodes**3, model.contact == "particles"
+        plan = plan_memory(steps, len(x), nodes, x.element_size(), cache_bytes, memory, total, contact)
+    simulation = Simulation(
+        model, regions, slices, state, steps, first, plan, scatter, total, copies, frictions
+    )
     *states, seen = RolloutFunction.apply(simulation, [n - first for n in frames], tracers, *inputs)
     path = Trajectory(frames, *states[:4], tracers=seen, F_total=states[4] if total else None)
     return path if flight is None else flight.followed_by(path), simulation.errors

@@ -13,6 +13,7 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import is_dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -57,6 +58,7 @@ class Simulation:
         scatter: scatter method, see `scatter`. None chooses the fastest.
         total: whether the state includes the total deformation.
         copies: number of independent simulations in the state that share launches, see `kernels`.
+        frictions: Coulomb coefficients of the obstacles for each copy. None: those of the model.
 
     Attributes:
         errors: after `run`, the error of each copy, or None.
@@ -74,11 +76,15 @@ class Simulation:
         scatter: str | None = None,
         total: bool = False,
         copies: int = 1,
+        frictions: Sequence[Sequence[float]] | None = None,
     ):
         self.model, self.regions, self.steps, self.first, self.plan = model, regions, steps, first, plan
         x = state.x
         scatter = scatter or scatter_for(x.device, x.dtype)
-        size = WorkspaceSize(model, len(x), x.dtype, x.device, total=total, copies=copies, scatter=scatter)
+        # Models that differ only in friction share workspaces.
+        size = WorkspaceSize(
+            model.frictionless, len(x), x.dtype, x.device, total=total, copies=copies, scatter=scatter
+        )
         if model.changes:
             size = size._replace(n_poses=steps + 1)
         if plan:
@@ -89,7 +95,8 @@ class Simulation:
                 differentiable=True,
             )
         self.workspace = pooled_workspace(size, user=self)
-        self.workspace.load_particles(state.mass.detach(), state.vol0.detach())
+        frictions = frictions or [model.frictions] * copies
+        self.workspace.load_particles(state.mass.detach(), state.vol0.detach(), np.array(frictions))
         if model.clamps:
             clamp = clamped_particles(model.clamps, state.x.detach()) if state.clamp is None else state.clamp
             self.workspace.clamp.copy_(clamp)

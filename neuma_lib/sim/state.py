@@ -110,8 +110,8 @@ class State:
 
     def to(self, device: torch.device | str) -> State:
         """Copy to another device."""
-        values = [getattr(self, name).to(device) for name in ("x", "v", "mass", "vol0", "F", "C")]
-        return State(*values, None if self.clamp is None else self.clamp.to(device))
+        moved = {name: getattr(self, name).to(device) for name in ("x", "v", "mass", "vol0", "F", "C")}
+        return State(**moved, clamp=None if self.clamp is None else self.clamp.to(device))
 
     @property
     def density(self) -> Tensor:

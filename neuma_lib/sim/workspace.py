@@ -12,6 +12,7 @@ from collections.abc import Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
@@ -20,7 +21,7 @@ from neuma_lib.sim import kernels
 from neuma_lib.sim.adjoint_kernels import adjoint_kernels
 from neuma_lib.sim.clamp_kernels import hold_type, holds
 from neuma_lib.sim.colliders import contact_radius
-from neuma_lib.sim.contact_kernels import distances, obstacle_type, obstacles
+from neuma_lib.sim.contact_kernels import STICKING, distances, obstacle_type, obstacles
 from neuma_lib.sim.graphs import MAX_GRAPHS, GraphCache
 from neuma_lib.sim.kernels import NO_FAULT, forward_kernels, warp_types
 from neuma_lib.sim.model import MPM, WALLS
@@ -72,7 +73,9 @@ class Workspace:
         grid_v: velocity [m/s] of the nodes and 1 where there is mass, shape (n_cached_steps, copies * nodes^3, 4).
         mass, vol0: particle masses [kg] and initial volumes [m^3], shape (N,).
         radius: radii of the particles in contact [m], shape (N,).
-        obstacles: colliders at the steps of a segment, or at one step if none changes, shape (poses, colliders).
+        frictions: Coulomb coefficients of the colliders for each copy, shape (copies, colliders).
+        obstacles: colliders at the steps of a segment, or at one step if none changes, with the friction of each copy,
+            shape (poses * copies, colliders).
         distances: values of the grids of colliders that are meshes.
         holds: clamps at the steps of a segment, or at one step if none changes, shape (poses, clamps).
         clamp: index of the clamp of each particle, or -1, shape (N,).
@@ -109,6 +112,7 @@ class Workspace:
         self.tau, self.F_trial = self._buffer((cached, N), "mat33"), self._buffer((cached, N), "mat33")
         self.grid, self.grid_v = self._buffer((cached, nodes), "vec4"), self._buffer((cached, nodes), "vec4")
         self.mass, self.vol0, self.radius = (self._buffer((N,), "real") for _ in range(3))
+        self.frictions = np.zeros((size.copies, len(size.model.obstacles)))
         self.obstacles = self._obstacles([0.0] * size.n_poses)
         self.distances = wp.array(
             distances(size.model.obstacles),
@@ -161,30 +165,42 @@ class Workspace:
             _run(self._cells, self.at(step))
             self.order[self.sorted_at(step)].copy_(torch.sort(self.cells, stable=True).indices)
 
-    def load_particles(self, mass: Tensor, vol0: Tensor) -> None:
-        """Set masses [kg], volumes [m^3] and radii of the particles."""
+    def load_particles(self, mass: Tensor, vol0: Tensor, frictions: np.ndarray) -> None:
+        """Set masses [kg], volumes [m^3] and radii of the particles, and `frictions`."""
         self.mass.copy_(mass)
         self.vol0.copy_(vol0)
         self.radius.copy_(contact_radius(vol0))
+        self.frictions = frictions
+        if self.size.n_poses == 1:
+            self._load_obstacles([0.0])
 
     def pose_at(self, step: int) -> int:
-        """Row of the obstacles in a step."""
+        """Pose of the obstacles in a step."""
         return step % self.size.n_poses
 
     def load_poses(self, first: int, steps: int) -> None:
         """Set the obstacles at the steps of a segment that starts at step ``first`` of the simulation."""
         if self.size.n_poses > 1:
             times = [self.size.model.dt * (first + n) for n in range(steps)]
-            for target, source in (
-                (self.obstacles, self._obstacles(times)),
-                (self.holds, self._holds(times)),
-            ):
-                wp.copy(target, source, count=source.size)
+            with self.stream():
+                self._load_obstacles(times)
+                source = self._holds(times)
+                wp.copy(self.holds, source, count=source.size)
+
+    def _load_obstacles(self, times: Sequence[float]) -> None:
+        """Set the first rows of the obstacles."""
+        if self._contact:
+            with self.stream():
+                source = self._obstacles(times)
+                wp.copy(self.obstacles, source, count=source.size)
 
     def _obstacles(self, times: Sequence[float]) -> wp.array:
-        """Colliders at some times [s]."""
+        """Colliders at some times [s], with the friction of each copy."""
+        poses = obstacles(self.size.model.obstacles, times, self.size.dtype)
+        rows = np.repeat(poses, self.size.copies, axis=0)
+        rows["friction"] = np.tile(np.minimum(self.frictions, STICKING), (len(times), 1))
         return wp.array(
-            obstacles(self.size.model.obstacles, times, self.size.dtype),
+            rows,
             dtype=obstacle_type(self.size.dtype),
             device=wp.device_from_torch(self.size.device),
         )
@@ -416,7 +432,7 @@ def _run(launch: wp.Launch, *indices: int) -> None:
 def _grid_constants(size: WorkspaceSize):
     model, t = size.model, warp_types(size.dtype)
     c = t.GridConstants()
-    c.particles = size.particles // size.copies
+    c.particles, c.copies = size.particles // size.copies, size.copies
     c.n, c.wall_nodes, c.first = model.nodes, model.wall_nodes, model.first_node
     c.faces = len(WALLS) if model.contact == "particles" else 0
     c.walls = t.walls(*(_CONDITION_CODES[condition] for condition in model.boundary))

@@ -171,6 +171,12 @@ def test_stresses_are_those_of_the_room():
     assert "unknown" in text
 
 
+def test_a_body_that_sticks_has_a_lower_bound_of_its_friction():
+    record = {"contact_friction": {"at_least": 0.75}}
+    text = Reader(page("mug", "NeuMA", identified=identified(**record))).text
+    assert "contact_friction" in text and "at least 0.75" in text
+
+
 @pytest.mark.parametrize(
     "value, text",
     [

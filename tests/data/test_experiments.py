@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ import yaml
 from neuma_lib.coupling.bodies import coloured_solid, join
 from neuma_lib.coupling.particle_binding import bind_two_pass
 from neuma_lib.coupling.reconstruction import Reconstruction
-from neuma_lib.data.ground_truth import TrueBody, simulate_ground_truth
+from neuma_lib.data.ground_truth import TrueBody, change_by_a_doubled_grid, simulate_ground_truth
 from neuma_lib.errors import InputError
 from neuma_lib.geometry.shapes import place
 from neuma_lib.geometry.volume import check_apart, sample_volume
@@ -144,6 +145,36 @@ def test_colliding_bodies_of_different_mass_exchange_momentum():
     # Tracers fill both bodies, equally densely.
     left = float((truth.tracers[0, :, 0] < 0.5).float().mean())
     assert left == pytest.approx(0.5, abs=0.04)
+
+
+def test_a_converged_truth_has_eight_particles_in_a_cell_and_its_file_fewer():
+    """The stored particles are drawn from the simulated ones, and represent all of the mass."""
+    mesh = solid(0.5)[0]
+    body = TrueBody(mesh, analytic_law(JELLY), (0.0, 0.0, 0.0), 1000.0)
+    model = MPM(24, 1e-3, gravity=(0.0, 0.0, 0.0))
+    options = dict(particles=None, tracers=50, seed=1)
+    whole = simulate_ground_truth(
+        model, [body, TrueBody(solid(0.2)[0], body.law, body.velocity)], (0, 1), **options
+    )
+    count = 8 * mesh.volume * 24**3
+    assert len(whole.mass) == pytest.approx(2 * count, rel=0.1)
+    drawn = simulate_ground_truth(model, [body], (0, 1), stored=100, **options)
+    assert drawn.path.x.shape[:2] == (2, 100) and len(drawn.vol0) == 100
+    assert float(drawn.mass.sum()) == pytest.approx(1000 * mesh.volume, rel=1e-4)
+    every = simulate_ground_truth(model, [body], (0, 1), **options)
+    nearest = torch.cdist(drawn.path.x[0], every.path.x[0]).amin(dim=1)
+    assert float(nearest.max()) < 1e-3 and float(drawn.path.x[0].std(dim=0).min()) > 0.9 * float(
+        every.path.x[0].std(dim=0).min()
+    )
+
+
+def test_the_change_by_a_doubled_grid_is_half_that_from_half_the_grid():
+    """Exact for an error of first order: tracers at distances 4 h, 2 h and h from their limit for grids of 1, 2, 4."""
+    limit = torch.rand(3, 20, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    direction = torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
+    grids = [SimpleNamespace(tracers=limit + error * direction) for error in (0.04, 0.02, 0.01)]
+    change = change_by_a_doubled_grid(grids[1], grids[0])
+    assert change == pytest.approx(float((grids[2].tracers - grids[1].tracers)[0, 0].norm()))
 
 
 def test_a_start_has_the_densities_and_motions_of_its_bodies(tmp_path):

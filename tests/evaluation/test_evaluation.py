@@ -15,7 +15,7 @@ from neuma_lib.methods.model import LawOnGrid
 from neuma_lib.sim.prediction import predict
 from neuma_lib.sim.rollout import rollout
 from tests.support.errors import refused
-from tests.support.grounding_scene import MODEL, PRIOR, RADIUS, TRUTH, ball
+from tests.support.grounding_scene import HEIGHT, MODEL, PRIOR, RADIUS, TRUTH, ball
 
 pytestmark = pytest.mark.core
 
@@ -25,7 +25,7 @@ IN_FLIGHT = [0, 5, 10, 20]
 """Frames before the ball of `ball()` touches the floor."""
 
 
-def in_ball(count: int, seed: int, height: float = 0.3) -> torch.Tensor:
+def in_ball(count: int, seed: int, height: float = HEIGHT) -> torch.Tensor:
     """Uniform points in the ball of `ball()`."""
     g = torch.Generator().manual_seed(seed)
     direction = torch.randn(count, 3, generator=g, dtype=torch.float64)
@@ -74,7 +74,7 @@ def test_a_known_shift_of_the_truth_is_the_error():
     """Tracers on a lattice wider than twice the shift, so that nearest neighbours are the same tracers."""
     shift = torch.tensor([3e-3, 0.0, 4e-3], dtype=torch.float64)  # 5 mm
     axis = 0.03 * torch.arange(-2, 3, dtype=torch.float64)
-    lattice = torch.cartesian_prod(axis, axis, axis) + torch.tensor([0.5, 0.3, 0.5], dtype=torch.float64)
+    lattice = torch.cartesian_prod(axis, axis, axis) + torch.tensor([0.5, HEIGHT, 0.5], dtype=torch.float64)
     (path,) = true_tracers(ball(), IN_FLIGHT, lattice)
     truth = path + shift
     truth[0] = lattice
@@ -112,7 +112,7 @@ class FailsOnce(Elasticity):
         return LAW.elasticity.response(F, weights) * (math.nan if self.count == self.step else 1)
 
 
-ON_THE_FLOOR = RADIUS + MODEL.free_range[0] - MODEL.dx / 2
+ON_THE_FLOOR = RADIUS - 0.01
 """Height at which particles of the ball feel the floor from the first step on."""
 
 

@@ -24,6 +24,7 @@ from neuma_lib.mechanics.neural import NeuralElasticity, NeuralPlasticity, neura
 from neuma_lib.mechanics.plasticity import PLASTICITIES
 from neuma_lib.mechanics.structured import structured_law
 from neuma_lib.mechanics.time_step import step_dependence
+from neuma_lib.methods.constants import Constants
 from neuma_lib.sim.model import MPM
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
@@ -395,6 +396,33 @@ def test_constants_are_exported_with_their_step(project):
     assert load_law(target, dt=1e-3).plasticity.values["dt"] == 1e-3
     about = read_about(target)
     assert about["kind"] == "analytic" and about["prior"] is None and about["visited"] is None
+
+
+def test_the_constants_of_the_material_are_exported_if_there_are_any(project):
+    """They hold on any grid, while those of the fit state theirs."""
+    file = project / "results/ClayCat/identified.json"
+    on_grid = json.loads(file.read_text())["law"]
+    material = {**on_grid, "plasticity": {"name": "viscous_flow", "viscosity": 70.0}}
+    write_json(file, {"law": on_grid, "grid": 24, "material": {"law": material}})
+    model = Constants().load({"identified": file}, {}, DT)
+    assert model.law.grid == 24 and model.law.plasticity.values["viscosity"] == 80.0
+    target = project / "law.safetensors"
+    assert main(["law", "export", str(project / "results/ClayCat/constants"), str(target)]) == 0
+    assert read_about(target)["grid"] is None and load_law(target).grid is None
+    assert load_law(target).plasticity.values["viscosity"] == 70.0
+
+
+def test_a_law_is_used_on_another_grid_with_a_warning(tmp_path, caplog):
+    law = networks()
+    save_adaptor(tmp_path / "adaptor.safetensors", law, 4, 16.0, {"grid": 24})
+    save_prior(tmp_path / "prior.safetensors", neural_law(seed=2), {})
+    learned = load_law(tmp_path / "prior.safetensors", tmp_path / "adaptor.safetensors")
+    one = torch.full((1,), 1e-3)
+    state = State.rigid(torch.tensor([[0.5, 0.5, 0.5]]), one, 1e-3 * one, (0.0, 0.0, 0.0))
+    for grid, warned in ((24, False), (32, True), (32, False)):
+        caplog.clear()
+        rollout(MPM(grid, 1e-4), learned, state, steps=1, frames=[1])
+        assert ("learned on a grid of 24" in caplog.text) == warned
 
 
 def test_folders_without_a_law_are_refused(project, capsys):

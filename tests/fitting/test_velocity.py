@@ -8,6 +8,7 @@ from neuma_lib.config.velocity import VelocityConfig
 from neuma_lib.coupling.particle_gs import ParticleGS
 from neuma_lib.fitting.velocity import UNKNOWNS, _Flight, estimate_velocity
 from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.sim.model import contact_clearance
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.splatting.observation import Observation
 from tests.support.errors import refused
@@ -173,7 +174,10 @@ def test_bytes_are_their_colours_and_few_frames_at_a_time_give_the_sums_of_all(m
 
 
 def test_a_body_that_starts_in_contact_is_an_input_error():
-    body = ball(height=0.13)
+    """The surface of its lowest particle is a tenth of a millimetre below the floor."""
+    body = ball(height=RADIUS)
+    body = ball(height=RADIUS - float(contact_clearance(MODEL, body.x0, body.vol0)) - 1e-4)
+    assert float(body.x0[:, 1].min()) > 0
     observation = observe(body, [0.0, 0.0, 0.0], FRAMES)
     with refused("frames"):
         estimate(body, observation)

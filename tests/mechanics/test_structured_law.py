@@ -452,7 +452,7 @@ def test_gradient_of_a_rollout(form):
     law = trained(form=form).double()
     x, mass, vol0 = cube(60, side=0.25, centre=(0.5, 0.12, 0.5))
     v, F, C = strained(x)
-    model = MPM(14, DT, boundary={"y_min": "sticky"})
+    model = MPM(14, DT)
     parameters = [p for p in law.parameters() if p.requires_grad]
     weight = torch.randn(60, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
 

@@ -1,9 +1,12 @@
 """Models of every method from small files, several bodies in one model, draws, and where methods come from."""
 
+import math
 import subprocess
 import sys
+from dataclasses import replace
 from importlib.metadata import EntryPoint
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,13 +20,15 @@ from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.neural import neural_law
 from neuma_lib.mechanics.structured import structured_law
 from neuma_lib.methods import registry
-from neuma_lib.methods.base import ModelSource, method_of
+from neuma_lib.methods.base import ModelSource, Problem, method_of
 from neuma_lib.methods.model import LawOnGrid
 from neuma_lib.methods.prior import prior_source
+from neuma_lib.methods.structured import Structured, StructuredOptions
 from neuma_lib.sim.model import MPM, consecutive
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 from tests.support.errors import refused
+from tests.support.grounding_scene import ball, observe
 
 ROOT = Path(__file__).resolve().parents[2]
 DT = 1e-3
@@ -64,9 +69,9 @@ def trained(law):
     return law
 
 
-def identified(path, spec=SPEC):
+def identified(path, spec=SPEC, **extra):
     fit = {"law": spec, "unbounded": {"values": [11.5, -0.4, 7.6], "covariance": COVARIANCE}}
-    write_json(path, {"law": spec, "best": fit, "families": {}, "ties": []})
+    write_json(path, {"law": spec, "best": fit, "families": {}, "ties": [], **extra})
     return str(path)
 
 
@@ -110,6 +115,59 @@ def test_constants_are_those_identified(tmp_path):
     assert torch.equal(bent(model.law), bent(analytic_law(SPEC)))
 
 
+@pytest.mark.parametrize(("record", "friction"), [({"value": 0.4}, 0.4), ({"at_least": 0.8}, math.inf)])
+@pytest.mark.parametrize("name", ["constants", "structured"])
+def test_identified_friction_moves_the_body(name, record, friction, tmp_path):
+    """The motion of the simulator with this coefficient for all obstacles. In another scene, a floor with a coefficient
+    keeps it."""
+    mpm = MPM(grid=16, dt=DT, contact="particles", boundary={"y_min": 0.1})
+    start = replace(cube(height=0.07), v=torch.tensor([1.0, -1.0, 0.0]))
+    if name == "constants":
+        files = {"identified": identified(tmp_path / "identified.json", contact_friction=record)}
+    else:
+        law, files = (
+            structured_law({**SPEC, "form": "stretch"}, DT, seed=0),
+            {"adaptor": str(tmp_path / "a.safetensors")},
+        )
+        about = {"stable": True, "contact_friction": record}
+        save_adaptor(files["adaptor"], trained(law), 2, 4.0, about)
+    x = {}
+    for elsewhere in (False, True):
+        model = loaded(name, files, {"elsewhere": True} if elsewhere else {})
+        path, failure = model.predict(mpm, start, (0, 40))
+        used = mpm if elsewhere else mpm.with_friction(friction)
+        expected = rollout(used, model.law, start, steps=40, frames=(0, 40))
+        assert failure is None and torch.equal(path.x, expected.x)
+        x[elsewhere] = path.x[-1]
+    assert (x[False] - x[True]).abs().max() > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("record", "friction"), [(None, 0.1), ({"value": 0.4}, 0.4), ({"at_least": 0.8}, math.inf)]
+)
+def test_a_correction_is_trained_with_the_identified_friction(record, friction, tmp_path, monkeypatch):
+    class Reached(Exception):
+        pass
+
+    def train(mpm, *args, **options):
+        assert set(mpm.frictions) == {friction}
+        raise Reached
+
+    body = ball(dtype=torch.float32)
+    seen = observe(body, (0.0, -2.0, 0.0), (0, 8, 16, 60, 64))
+    monkeypatch.setattr("neuma_lib.fitting.structured_fit.train_structured", train)
+    for part, stub in (("load_reconstruction", body), ("with_motion", body.state((0.0, -2.0, 0.0)))):
+        monkeypatch.setattr(f"neuma_lib.methods.training.{part}", lambda *files, stub=stub: stub)
+    monkeypatch.setattr("neuma_lib.methods.training.load_videos", lambda *files, **exposure: [seen])
+    inputs = dict.fromkeys(("particles", "binding", "gaussians", "velocity", "transforms"), "none")
+    extra = {"contact_friction": record} if record else {}
+    inputs["identified"] = identified(tmp_path / "identified.json", **extra)
+    problem = Problem({"dt": 2e-3, "grid": 16, "contact": "particles", "boundary": 0.1}, [1000.0], {})
+    run = SimpleNamespace(device=torch.device("cpu"), checkpoint=lambda *known: None, progress=None, log=None)
+    with pytest.raises(Reached):
+        Structured().fit(inputs, {"base": None, **StructuredOptions().plain()}, problem, run)
+
+
 def test_the_true_law_needs_no_file():
     model = loaded("true_law", {}, {"law": STIFF})
     assert torch.equal(bent(model.law), bent(analytic_law(STIFF)))
@@ -139,7 +197,8 @@ def test_models_together_move_as_consecutive_bodies():
         *(torch.cat([getattr(s, name) for s in (below, above)]) for name in ("x", "v", "mass", "vol0"))
     )
     laws, counts = [analytic_law(SPEC, DT), analytic_law(STIFF, DT)], [len(below.x), len(above.x)]
-    model = LawOnGrid.together([LawOnGrid(law, stable=k > 0) for k, law in enumerate(laws)], counts)
+    each = [LawOnGrid(law, stable=k > 0, friction=0.3) for k, law in enumerate(laws)]
+    model = LawOnGrid.together(each, counts)  # with the friction of the simulation
     frames = (0, 30, 60)
     path, failure = model.predict(mpm, both, frames)
     expected = rollout(mpm, consecutive(laws, counts), both, steps=60, frames=frames)

@@ -60,7 +60,7 @@ def film(carried, spec):
 
 def contact(carried):
     """Step of the last frame before contact."""
-    return benchmark.contact(carried.moving.x, FRAMES)
+    return benchmark.contact(carried.moving, FRAMES)
 
 
 def changed(family, **values):

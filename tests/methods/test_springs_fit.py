@@ -108,7 +108,7 @@ def test_steps_of_single_frames_approach_it(problem):
 
 @pytest.mark.slow
 def test_motion_of_an_elastic_body_is_recovered_to_a_centimetre():
-    """The truth is simulated on a grid, whose soft walls the fitted gap stands for."""
+    """The truth is simulated on a grid. The fitted gap is the radius at which its particles touch the floor."""
     body, frames = ball(), tuple(range(0, 101, 5))
     anchored = SpringBody.of(body.x0, 120, 24, 6, 0.5, 16)
     start = body.state(V0)

@@ -91,21 +91,25 @@ def test_pages_are_updated_from_tables_and_figures(project, monkeypatch):
     assert recorded(project, monkeypatch) == (readme, page)
 
 
-def test_random_scenes_and_finer_truths_have_their_verdicts(project, monkeypatch):
-    columns = {scene: scene for scene in PAPER["finer_truth"].columns}
+def test_random_scenes_and_table1_convergeds_have_their_verdicts(project, monkeypatch):
+    columns = {scene: scene for scene in PAPER["table1_converged"].columns}
     errors = {"nclaw": 50.0, "neuma": 5.0, "true_law": 8.0}
     metrics = {
         method: {c: [run(error + k) for k in range(3)] for c in columns} for method, error in errors.items()
     }
-    table = chamfer_table(metrics, METHODS, columns, PAPER["finer_truth"])
+    table = chamfer_table(metrics, METHODS, columns, PAPER["table1_converged"])
     scenes = [result(str(k), 8.0, 2.0 if k else 9.0) for k in range(12)]
     csv, markdown, _ = random_table(scenes, METHODS, 7)
-    for name, text, values in (("finer_truth", table.markdown(), table.csv()), ("random", markdown, csv)):
+    for name, text, values in (
+        ("table1_converged", table.markdown(), table.csv()),
+        ("random", markdown, csv),
+    ):
         (project / f"results/{name}.md").write_text(text)
         (project / f"results/{name}.csv").write_text(values)
     _, page = recorded(project, monkeypatch)
     assert (
-        "| [finer_truth](finer_truth.md) | with finer truths, NeuMA is closer than its prior | **holds** | 6.0 ± 1.0"
+        "| [table1_converged](table1_converged.md) | with converged truths, NeuMA is closer than its prior | **holds** "
+        "| 6.0 ± 1.0"
         " (NeuMA) against 51.0 ± 1.0 (NCLaw), lower in 6 of 6 | not compared there |\n| [random](random.md) |"
     ) in page
     assert (
@@ -113,7 +117,7 @@ def test_random_scenes_and_finer_truths_have_their_verdicts(project, monkeypatch
         " 11 of 12, errors 0.25 to 1.12 times as large | not compared there |"
     ) in page
     assert page.count("| [random](random.md) |") == 4
-    closer = page[page.index("\n\n[finer_truth](finer_truth.md): The true law") :]
+    closer = page[page.index("\n\n[table1_converged](table1_converged.md): The true law") :]
     assert "than it: NeuMA in 6 of 6 columns (there by 3.0 of 9.0 mm on average)" in closer
     assert "Made by `snakemake random` and" in (project / "docs/random.md").read_text()
 
@@ -128,8 +132,10 @@ def test_settings_of_the_run_are_named(project, monkeypatch):
 def test_tables_that_are_not_recorded_are_named(project, monkeypatch):
     _, page = recorded(project, monkeypatch)
     missing = page[page.index("Not recorded: ") :].partition(".\n")[0]
-    assert "finer_truth (`snakemake results/finer_truth.csv`), random (`snakemake random`)" in missing
-    assert "table1 (" not in missing and "finer_truth](" not in page and "random](" not in page
+    assert (
+        "table1_converged (`snakemake results/table1_converged.csv`), random (`snakemake random`)" in missing
+    )
+    assert "table1 (" not in missing and "table1_converged](" not in page and "random](" not in page
     whole = dict.fromkeys(record.MADE_BY, f"{record.VERDICT_HEAD} here |\n|---|---|---|\n")
     assert "ecorded" not in record.verdicts(whole)
     assert "older version, without verdicts: table2." in record.verdicts(whole | {"table2": "- Holds: ..."})

@@ -122,6 +122,15 @@ def test_methods_that_tables_name_exist(changed):
         changed(figures={"beside": ["spring_gaus+law_from=ClayCat"]})
 
 
+def test_identified_friction_leaves_other_scenes_their_coefficients(changed, loaded):
+    own = changed(identify={"contact_friction": "fitted"}, simulation={"contact": "particles"})
+    for name in ("constants", "neuma_structured"):
+        elsewhere = f"{name}+law_from=ClayCat"
+        assert cases.case(own, "BouncyBall", name).source().options == {}
+        assert cases.case(own, "BouncyBall", elsewhere).source().options == {"elsewhere": True}
+        assert cases.case(loaded, "BouncyBall", elsewhere).source().options == {}
+
+
 class TestPriors:
     def test_of_the_scene_or_the_preset(self, loaded):
         names = ("neuma", "neuma+prior=sand")

@@ -91,12 +91,27 @@ MISTAKES = [
     ({"advanced": {"identify.views": [0]}}, "advanced.identify.views"),
     ({"advanced": {"identify.spread": -2}}, "identify.spread"),
     ({"identify": {"spread": 2}}, "identify.spread"),
+    ({"identify": {"contact_friction": 0.3}}, "identify.contact_friction"),
+    (
+        {"identify": {"contact_friction": "fitted"}, "simulation": {"contact": "nodes"}},
+        "identify.contact_friction",
+    ),
     ({"gaussians": {"densification": {"every": 3}}}, "gaussians.densification.every"),
     ({"methods": 3}, "methods"),
     ({"extensions": ["os"]}, "extensions"),
     ({"scenes": {"New": {"like": ["BouncyBall"]}}}, "scenes.New.like"),
     ({"simulation": {"boundary": "no_slp"}}, "simulation.boundary"),
+    ({"simulation": {"boundary": "sticky"}}, "simulation.boundary"),
+    ({"simulation": {"boundary": {"x_min": "sticky"}}}, "simulation.boundary"),
     ({"simulation": {"boundary": {"x_mn": "slip"}}}, "simulation.boundary"),
+    *[
+        ({"simulation": {"contact": contact, "boundary": boundary}}, "simulation.boundary")
+        for contact, boundary in [("nodes", 0.3), ("released", {"y_min": 0.3}), ("particles", "sticky")]
+    ],
+    *[
+        ({"simulation": {"contact": "particles", "boundary": {"y_min": boundary}}}, "simulation.boundary")
+        for boundary in (-0.1, True, "0.3", [1], float("nan"), float("inf"))
+    ],
     ({"scenes": {"BouncyBall": {"appearance": {"accent": "red"}}}}, "scenes.BouncyBall.appearance.accent"),
     ({"random": {"count": 1_000_000}}, "random.count"),
     ({"advanced": {"radiance.particles": 10**9}}, "radiance.particles"),
@@ -380,15 +395,22 @@ class TestTruth:
         assert self.values(own.experiment_truth("letter_N_clay")) == (40, 2.5e-4, 9000)
         assert own.frame_steps("BouncyBall") == loaded.frame_steps("BouncyBall")
 
-    def test_the_refined_table_doubles_the_resolution_and_is_optional(self, loaded):
-        table = loaded.tables["finer_truth"]
+    def test_the_converged_table_has_96_cells_and_is_optional(self, loaded, changed):
+        table = loaded.tables["table1_converged"]
         assert not table.default_target and set(loaded.tables["table1"].methods) < set(table.methods)
         for name, scene in zip(table.scenes, loaded.tables["table1"].scenes, strict=True):
             refined, plain = loaded.scene_truth(name), loaded.scene_truth(scene)
-            assert refined.grid == 2 * plain.grid and refined.particles == 8 * plain.particles
-            assert plain.dt == 2 * refined.dt
+            assert refined.grid == 96 and refined.particles is None
+            assert plain.dt == pytest.approx(4 * refined.dt)
             assert loaded.scene(name).law == loaded.scene(scene).law
         assert not {*table.scenes, *loaded.random_scenes} & set(loaded.plain_scenes)
+        for grid, truth in ((32, 128), (36, 144), (48, 96)):
+            other = changed(simulation={"grid": grid}, random={"count": 0})
+            assert other.scene_truth(table.scenes[0]).grid == truth
+        everywhere = changed(dataset={"grid": "converged"})
+        assert (
+            everywhere.scene_truth("ClayCat").grid == everywhere.experiment_truth("letter_N_clay").grid == 96
+        )
 
     def test_laws_outside_every_family_are_in_no_prior_random_scene_or_other_table(self, loaded):
         table = loaded.tables["outside"]
@@ -468,7 +490,7 @@ def test_page_and_schema_are_up_to_date():
 
 def test_page_and_schema_have_public_keys_alone():
     page, schema = settings_markdown(), json.loads(settings_schema())
-    assert page.count("\n| `") <= 214
+    assert page.count("\n| `") <= 201
     assert "| `penalty` |" in page and "| `spread` |" not in page
     known = schema["$defs"]["IdentifyConfig"]["properties"]
     assert "penalty" in known and "spread" not in known

@@ -154,10 +154,10 @@ def test_both_the_true_law_and_the_prior_are_stable(loaded, many):
 def test_bodies_start_inside_and_land_in_time(many):
     """Of the turning mesh itself: six frames of 33 before it is at y = 0, no later than in half of the video.
 
-    The stencil feels the ground half a cell above: five frames; till the body is at y = 0, it feels no other wall. The
-    ellipsoid of the latest contact does not fill every corner of a body: 5 % of the video later.
+    Contact of nodes feels the ground half a cell above: five frames; till the body is at y = 0, it feels no other wall.
+    The ellipsoid of the latest contact does not fill every corner of a body: 5 % of the video later.
     """
-    low, high = MPM(grid=24, dt=1e-3).free_range
+    low, high = MPM(grid=24, dt=1e-3, contact="nodes").free_range
     bodies = {name: shapes.build(name, resolution=32) for name in SHAPES}
     for name, scene in many.items():
         mesh = bodies[scene["shape"]]

@@ -13,43 +13,13 @@ from neuma_lib.sim.free_flight import free_flight_steps
 from neuma_lib.sim.model import MPM, as_regions, contact_clearance
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
+from tests.support.contact_scenes import COLLIDERS, MOTION, SHAPES, falling_on, lattice
 from tests.support.errors import refused
-from tests.support.sim_scenes import (
-    DENSITY,
-    DT,
-    angular_momentum,
-    cube,
-    linear_momentum,
-    make_law,
-    moving_cube,
-)
+from tests.support.sim_scenes import DENSITY, DT, angular_momentum, linear_momentum, make_law, moving_cube
 
 pytestmark = pytest.mark.core
 
 GRAVITY = 9.8
-MOTION = {"velocity": (0.2, 0.5, -0.3), "spin": (1.0, -2.0, 3.0)}
-SHAPES = {
-    "plane": Collider.plane((0.5, 0.3, 0.5), (0.2, 1.0, -0.1), friction=0.3),
-    "box": Collider("box", (0.15, 0.1, 0.2), (0.45, 0.25, 0.5), (0.2, 0.4, -0.1), friction=0.4),
-    "sphere": Collider("sphere", (0.15,), (0.4, 0.22, 0.5), friction=0.3, damping=0.3),
-    "capsule": Collider("capsule", (0.2, 0.08), (0.5, 0.3, 0.5), (0.0, 0.3, 1.4), friction=0.5),
-}
-COLLIDERS = {
-    **SHAPES,
-    "sticking": replace(SHAPES["sphere"], friction=math.inf),
-    "frictionless": replace(SHAPES["box"], friction=0.0),
-    "moving": replace(SHAPES["box"], **MOTION, damping=0.2),
-}
-
-
-def falling_on(collider, **options):
-    """A model with a collider and an inclined plane, and a spinning cube 1 cm above them that slides to the side."""
-    model = MPM(14, DT, contact="particles", colliders=(collider, SHAPES["plane"]), **options)
-    x, mass, vol0 = cube(60, side=0.2, centre=(0.45, 0.7, 0.5))
-    while (clearance := float(contact_clearance(model, x, vol0))) > 0.0101:
-        x = x - (clearance - 0.01) * torch.tensor([0.0, 1.0, 0.0]).double()
-    velocity, spin = torch.tensor([[1.0, -1.5, 0.3], [3.0, -2.0, 4.0]]).double()
-    return model, State.rigid(x, mass, vol0, velocity, spin)
 
 
 def loss_of(path):
@@ -161,14 +131,6 @@ def test_free_flight_ends_where_the_body_touches(moving):
     torch.testing.assert_close(skipped.x, path.x[[50, 100]], rtol=0, atol=1e-9)
 
 
-def lattice(side, count, centre):
-    """A cube on a regular lattice: positions, masses and volumes."""
-    ticks = side * ((torch.arange(count) + 0.5) / count - 0.5).double()
-    x = torch.cartesian_prod(ticks, ticks, ticks) + torch.tensor(centre, dtype=torch.float64)
-    vol0 = torch.full((len(x),), side**3 / len(x), dtype=torch.float64)
-    return x, DENSITY * vol0, vol0
-
-
 @pytest.mark.parametrize("friction, angle", [(0.3, 30.0), (0.0, 30.0), (0.8, 30.0), (0.3, 10.0)])
 def test_a_block_on_an_inclined_plane(friction, angle):
     """It slides with g (sin a - mu cos a), and stays if mu > tan a.
@@ -193,20 +155,23 @@ def test_a_block_on_an_inclined_plane(friction, angle):
         assert abs(float(path.x[1, :, 0].mean() - path.x[0, :, 0].mean())) < 1e-3
 
 
-def test_momenta_change_by_the_impulse_on_the_collider():
+@pytest.mark.parametrize("friction", [0.0, 0.4, math.inf])
+def test_momenta_change_by_the_impulse_on_the_collider(friction):
     """Linear and angular momentum of a step, gravity and contact, to round-off.
 
     The transfer conserves both, except for the moment of the stress of the affine velocities, which is symmetric here.
+    The torch twin has the displacements that friction depends on.
     """
-    model, start = falling_on(replace(COLLIDERS["moving"], friction=0.0))
+    model, start = falling_on(replace(COLLIDERS["moving"], friction=friction))
     model = replace(model, colliders=model.colliders[:1])
     law = make_law("fixed_corotated")
     path = rollout(model, law, start, steps=41, frames=(40, 41))
     before = State(path.x[0], path.v[0], start.mass, start.vol0, path.F[0], path.C[0])
-    # The law of friction depends on the displacement since first contact, which no state holds: no friction here.
-    v, _ = torch_simulation.contact(
-        model, before.x, before.v, torch.zeros_like(before.x), before.vol0, 40 * DT
-    )
+    twin = (*start.motion, torch.zeros_like(start.x))
+    for n in range(40):
+        twin = torch_simulation.step(model, as_regions(law, 60), *twin, start.mass, start.vol0, n * DT)
+    torch.testing.assert_close(twin[0], before.x, rtol=0, atol=1e-12)
+    v, _ = torch_simulation.contact(model, before.x, before.v, twin[-1], before.vol0, 40 * DT)
     impulse = start.mass[:, None] * (v - before.v)
     assert impulse.norm() > 1e-3 * linear_momentum(start.mass, before.v).norm()
     weight = start.mass.sum() * DT * torch.tensor(model.gravity, dtype=torch.float64)
@@ -273,11 +238,28 @@ def test_wrong_colliders_are_refused(settings, where):
         Collider(**settings)
 
 
+def test_walls_and_colliders_have_coefficients_of_their_own_or_one_in_common():
+    model = MPM(16, DT, contact="particles", boundary={"y_min": 0.3, "x_max": "slip", "z_min": math.inf})
+    model = replace(model, colliders=(SHAPES["box"], COLLIDERS["sticking"]))
+    own = [math.inf, 0.0, 0.3, math.inf, math.inf, math.inf, 0.4, math.inf]
+    assert [obstacle.friction for obstacle in model.obstacles] == own
+    assert {obstacle.friction for obstacle in model.with_friction(0.7).obstacles} == {0.7}
+    others = model.with_friction(0.7, given=False)
+    assert [each.friction for each in others.obstacles] == [0.7 if mu == math.inf else mu for mu in own]
+    assert model.with_friction(math.inf) == model.with_friction(0.7).with_friction(math.inf)
+    with refused("friction"):
+        MPM(16, DT, contact="nodes").with_friction(0.3)
+
+
 def test_wrong_models_are_refused():
     with refused("colliders"):
-        MPM(16, DT, colliders=(SHAPES["box"],))
-    with refused("boundary"):
-        MPM(16, DT, contact="particles", boundary="sticky")
+        MPM(16, DT, contact="nodes", colliders=(SHAPES["box"],))
+    for boundary in ("sticky", -0.1, math.nan, True, None, {"y_min": "0.3"}):
+        with refused("boundary"):
+            MPM(16, DT, contact="particles", boundary=boundary)
+    for contact in ("nodes", "released"):
+        with refused("boundary"):
+            MPM(16, DT, contact=contact, boundary={"y_min": 0.3})
     with refused("collider.normal"):
         Collider.plane((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     assert set(SIZES) == {*SHAPES, "mesh"}  # test_mesh_colliders.py has that one

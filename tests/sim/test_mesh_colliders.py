@@ -60,7 +60,7 @@ def falling_on(colliders):
 def loss_of(path):
     generator = torch.Generator().manual_seed(0)
     return sum(
-        (torch.randn(value.shape, generator=generator, dtype=value.dtype) * value).sum()
+        (torch.randn(value.shape, generator=generator, dtype=value.dtype).to(value.device) * value).sum()
         for value in (10 * path.x, path.v, path.F)
     )
 
@@ -139,6 +139,24 @@ def test_equals_the_torch_twin(name):
     )
     path = rollout(model, make_law("neo_hookean", torch.float32), single, steps=40, frames=(40,))
     torch.testing.assert_close(path.x[0].double(), slow[1], rtol=0, atol=1e-5)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+@pytest.mark.parametrize("name", COLLIDERS)
+def test_cuda_equals_cpu(name):
+    """States and gradients, direct and as a replayed graph."""
+    model, start = falling_on(COLLIDERS[name])
+    law = make_law("neo_hookean")
+    results = []
+    for device in ("cpu", "cuda", "cuda", "cuda"):
+        own = start.to(device)
+        own = replace(own, x=own.x.clone().requires_grad_(), v=own.v.clone().requires_grad_())
+        path = rollout(model, law, own, steps=40, frames=(20, 40))
+        grads = torch.autograd.grad(loss_of(path), (own.x, own.v))
+        results.append([value.detach().cpu() for value in (path.x, *grads)])
+    for other in results[1:]:
+        for a, b in zip(other, results[0], strict=True):
+            assert (a - b).abs().max() < 1e-9 * b.abs().max()
 
 
 @pytest.mark.parametrize("name", COLLIDERS)

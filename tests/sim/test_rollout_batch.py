@@ -1,5 +1,6 @@
 """Several rollouts in the same launches: equality with single rollouts, divergence of one, laws without kernels."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -9,6 +10,7 @@ from neuma_lib.errors import NonFiniteError
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.analytic_fused import fusible, side_by_side
 from neuma_lib.sim.batch import rollout_batch
+from neuma_lib.sim.colliders import Collider
 from neuma_lib.sim.memory import MemoryPlan
 from neuma_lib.sim.model import MPM, MaterialRegion
 from neuma_lib.sim.rollout import RolloutFunction, rollout
@@ -151,6 +153,43 @@ def test_laws_without_kernels_share_the_transfers():
         assert_same(path, rollout(MODEL, own, falling(), **RUN), 1e-9)
 
 
+SLIDING = MPM(16, DT, contact="particles", colliders=(Collider("sphere", (0.1,), (0.7, 0.05, 0.5)),))
+FRICTIONS = (0.0, 0.2, 0.5, math.inf)
+
+
+@pytest.mark.parametrize("moves", [False, True])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_every_copy_has_its_own_friction(dtype, moves):
+    """The bytes of a batch whose copies all have it. Against a rollout alone, round-off. Rough floors brake more."""
+    laws = [law("von_mises", 1 + 0.1 * copy) for copy in range(len(FRICTIONS))]
+    sphere = replace(SLIDING.colliders[0], velocity=(0.0, 0.3, 0.0) if moves else (0.0, 0.0, 0.0))
+    start = falling(dtype, velocity=(2.0, -1.0, 0.3))
+    models = [replace(SLIDING, colliders=(sphere,)).with_friction(mu) for mu in FRICTIONS]
+    paths = rollout_batch(models, laws, start, **RUN)
+    for copy, (model, own, path) in enumerate(zip(models, laws, paths, strict=True)):
+        assert_same(path, rollout_batch(model, laws, start, **RUN)[copy])
+        assert_same(path, rollout(model, own, start, **RUN), 1e4 * torch.finfo(dtype).eps)
+    along = torch.stack([path.v[-1, :, 0].mean() for path in paths])
+    assert (along.diff() < -0.01).all()
+
+
+def test_coefficients_differ_by_wall():
+    """Of two copies with two coefficients, on the floor and a wall."""
+    floors = [{"y_min": 0.1, "x_max": 0.7}, {"y_min": 0.7, "x_max": "slip"}]
+    models = [MPM(16, DT, contact="particles", boundary=floor) for floor in floors]
+    start = moving_cube((3.0, -2.0, 0.5), centre=(0.8, 0.21, 0.5))
+    paths = rollout_batch(models, [law("hencky")] * 2, start, **RUN)
+    for model, path in zip(models, paths, strict=True):
+        assert_same(path, rollout(model, law("hencky"), start, **RUN), 1e-9)
+    assert (paths[0].x[-1] - paths[1].x[-1]).abs().max() > 1e-3
+
+
+def test_models_that_differ_in_more_than_friction_are_refused():
+    for models in ([SLIDING], [SLIDING, replace(SLIDING, dt=2 * DT)], [SLIDING, MODEL]):
+        with refused("model"):
+            rollout_batch(models, [law("hencky")] * 2, falling(), **RUN)
+
+
 def test_wrong_starts_are_named():
     two = [law("hencky")] * 2
     for laws, start in (([], falling()), (two, [falling()]), (two, [falling(), falling(count=9)])):
@@ -158,22 +197,25 @@ def test_wrong_starts_are_named():
             rollout_batch(MODEL, laws, start, **RUN)
 
 
-def test_gradients_of_copies_are_those_of_each():
+@pytest.mark.parametrize("models", [(MODEL, MODEL), tuple(SLIDING.with_friction(mu) for mu in (0.2, 0.5))])
+def test_gradients_of_copies_are_those_of_each(models):
     """The adjoint separates copies as well: same gradients of x and v as of each simulation alone."""
     starts = [falling(), falling(velocity=(1.0, -2.5, 0.5))]
     own = make_law("hencky")
 
-    def gradients(state, copies):
+    def gradients(state, *models):
+        frictions = [model.frictions for model in models]
         bodies = (MaterialRegion(own, 0, len(state.x)),)
         weights, slices = gather_weights(bodies, state.x.dtype)
         plan = MemoryPlan(FRAMES[-1], True, 0)
-        simulation = Simulation(MODEL, bodies, slices, state, FRAMES[-1], plan=plan, copies=copies)
+        options = dict(plan=plan, copies=len(models), frictions=frictions)
+        simulation = Simulation(models[0], bodies, slices, state, FRAMES[-1], **options)
         start = [value.clone().requires_grad_() for value in state.motion]
         x, *_ = RolloutFunction.apply(simulation, FRAMES, None, *start, *weights)
         return torch.autograd.grad(x[-1].square().sum(), start[:2])
 
-    together = gradients(State.joined(starts), 2)
-    alone = [gradients(state, 1) for state in starts]
+    together = gradients(State.joined(starts), *models)
+    alone = [gradients(state, model) for state, model in zip(starts, models, strict=True)]
     for actual, expected in zip(together, zip(*alone, strict=True), strict=True):
         assert torch.equal(actual, torch.cat(expected))
 
@@ -187,15 +229,19 @@ def test_constants_are_weights_so_that_graphs_serve_all():
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_the_gpu_agrees_also_when_it_replays(dtype):
-    """Three times, with other constants each time: run, recorded, replayed. One copy diverges in the second."""
+@pytest.mark.parametrize("contact", ["nodes", "particles"])
+def test_the_gpu_agrees_also_when_it_replays(dtype, contact):
+    """Three times, with other constants and friction each time: run, recorded, replayed. One copy diverges in the
+    second."""
     for stiffness in (1.0, 1.2, 0.8):
         laws = [law(name, stiffness) for name in FUSED]
         if stiffness == 1.2:
             laws[2] = analytic_law(UNSTABLE)
-        start = falling(dtype)
-        on_gpu = rollout_batch(MODEL, laws, start.to("cuda"), **RUN, total=True)
-        on_cpu = rollout_batch(MODEL, laws, start, **RUN, total=True)
+        start, models = falling(dtype), [MODEL] * len(laws)
+        if contact == "particles":
+            models = [SLIDING.with_friction(0.1 * copy * stiffness) for copy in range(len(laws))]
+        on_gpu = rollout_batch(models, laws, start.to("cuda"), **RUN, total=True)
+        on_cpu = rollout_batch(models, laws, start, **RUN, total=True)
         for actual, expected in zip(on_gpu, on_cpu, strict=True):
             assert (actual is None) == (expected is None)
             if actual:

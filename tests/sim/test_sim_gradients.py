@@ -12,12 +12,15 @@ from neuma_lib.sim.model import MPM, MaterialRegion, contact_clearance
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 from tests.support.errors import refused
-from tests.support.sim_scenes import DT, cube, make_law, strained
+from tests.support.sim_scenes import BOUNDARIES, DT, cube, make_law, strained
 
 pytestmark = pytest.mark.core
 
 IN_THE_AIR = MPM(14, DT)
-ON_A_STICKY_FLOOR = MPM(14, DT, boundary={"y_min": "sticky"})  # stops its nodes always: no switch
+ON_A_FLOOR = MPM(14, DT)
+ON_A_STICKY_FLOOR = MPM(
+    14, DT, boundary={"y_min": "sticky"}, contact="nodes"
+)  # stops its nodes always: no switch
 ON_A_RELEASED_FLOOR = MPM(14, DT, boundary={"y_min": "sticky"}, contact="released")
 TOUCHING = 0.12
 """Height [m] at which the cube of `scene` is in the floor."""
@@ -116,8 +119,8 @@ def assert_gradients_match(model, law, state, frames, sizes, **options):
 
 @pytest.mark.parametrize(
     "model, height",
-    [(IN_THE_AIR, 0.5), (ON_A_STICKY_FLOOR, TOUCHING), (ON_A_RELEASED_FLOOR, 0.2)],
-    ids=["air", "floor", "released"],
+    [(IN_THE_AIR, 0.5), (ON_A_FLOOR, TOUCHING), (ON_A_STICKY_FLOOR, TOUCHING), (ON_A_RELEASED_FLOOR, 0.2)],
+    ids=["air", "floor", "nodes", "released"],
 )
 @pytest.mark.parametrize("steps", [1, 20])
 @pytest.mark.parametrize("name", ["fixed_corotated", "hencky", "neo_hookean", "viscous_flow", "neural"])
@@ -136,10 +139,10 @@ BOUNCE = [1e-6, 1e-6, 1e-6, 1e-5]
 """Steps of differences. C moves particles by a time step of itself: a larger step stands out of the round-off."""
 
 
-@pytest.mark.parametrize("boundary", ["no_slip", "slip", "sticky"])
-def test_finite_differences_through_a_bounce(boundary):
-    """From free flight to the way back, with respect to x0, v0, F0 and C0; nodes start and stop on the way."""
-    model, law, frames = MPM(14, DT, boundary=boundary), make_law("hencky"), (0, 40, 100)
+@pytest.mark.parametrize("contact, boundary", BOUNDARIES)
+def test_finite_differences_through_a_bounce(contact, boundary):
+    """From free flight to the way back, with respect to x0, v0, F0 and C0; contacts start and stop on the way."""
+    model, law, frames = MPM(14, DT, boundary=boundary, contact=contact), make_law("hencky"), (0, 40, 100)
     path, vol0 = simulate(model, law, falling(), frames), falling().vol0
     assert contact_clearance(model, path[0][0], vol0) > 0 > contact_clearance(model, path[0][1], vol0)
     assert boundary == "sticky" or path[1][2, :, 1].mean() > 0.5
@@ -163,7 +166,7 @@ def test_finite_differences_of_the_total_deformation_where_a_body_flows(name, fa
 CONTACTS = [("nodes", False), ("released", False), ("nodes", True), ("particles", True)]
 
 
-def corner(contact="nodes"):
+def corner(contact):
     """A model whose walls differ, and a cube in the corner where three of them meet."""
     boundary = {"y_min": "no_slip", "x_min": "slip"}
     if contact != "particles":
@@ -221,9 +224,10 @@ def test_pressed_against_the_end_of_the_grid():
     assert_near(grads, gradients(model, law, start, frames, run=simulate_slowly)[1])
 
 
-def test_several_bodies_equal_torch_twin():
+@pytest.mark.parametrize("contact", ["particles", "nodes"])
+def test_several_bodies_equal_torch_twin(contact):
     """Two bodies in contact, one law used twice and trained: its gradients add up."""
-    model, start = corner()
+    model, start = corner(contact)
     law, other = make_law("neural"), make_law("hencky")
     parameters = trainable(law)
     bodies = [MaterialRegion(law, 0, 25), MaterialRegion(other, 25, 40), MaterialRegion(law, 40, COUNT)]

@@ -1,5 +1,7 @@
 """The simulator against conservation laws and closed forms, at its walls, and on input it must refuse."""
 
+import math
+
 import pytest
 import torch
 
@@ -13,6 +15,7 @@ from neuma_lib.sim.state import State, cross_matrix
 from neuma_lib.sim.workspace import Workspace, WorkspaceSize
 from tests.support.errors import refused
 from tests.support.sim_scenes import (
+    BOUNDARIES,
     DENSITY,
     DT,
     EVERY_LAW,
@@ -137,16 +140,16 @@ def test_free_rotation_of_a_stiff_cube():
     assert w * t * r > 100 * error  # it did turn
 
 
-@pytest.mark.parametrize("condition", ["no_slip", "slip", "sticky"])
+@pytest.mark.parametrize("contact, condition", BOUNDARIES)
 @pytest.mark.parametrize("wall", WALLS)
-def test_impact_on_a_wall(wall, condition):
+def test_impact_on_a_wall(wall, contact, condition):
     """The body stays inside and turns; its motion along the wall lasts if the wall is slippery.
 
     It arrives after 0.018 s and rebounds when a wave has crossed it twice, 2 side / c = 0.049 s later. A wall
     that does not hold only takes momentum that points into it, and no wall gives energy.
     """
     axis, side = WALLS.index(wall) // 2, 1 if wall.endswith("max") else -1
-    model = MPM(16, DT, gravity=(0.0, 0.0, 0.0), boundary=condition)
+    model = MPM(16, DT, gravity=(0.0, 0.0, 0.0), boundary=condition, contact=contact)
     centre = [0.5, 0.5, 0.5]
     centre[axis] = 0.69 if side > 0 else 0.25
     velocity = [0.2] * 3
@@ -170,9 +173,11 @@ def test_impact_on_a_wall(wall, condition):
 
 
 def test_walls_have_their_own_conditions():
-    model = MPM(16, DT, boundary={"y_min": "slip", "x_max": "sticky"})
+    model = MPM(16, DT, boundary={"y_min": "slip", "x_max": "sticky"}, contact="nodes")
     assert model.boundary == ("no_slip", "sticky", "slip", "no_slip", "no_slip", "no_slip")
-    assert hash(model) == hash(MPM(16, DT, boundary=model.boundary))
+    assert hash(model) == hash(MPM(16, DT, boundary=model.boundary, contact="nodes"))
+    faces = MPM(16, DT, boundary={"y_min": "slip"}).obstacles
+    assert [face.friction for face in faces] == [math.inf, math.inf, 0.0, math.inf, math.inf, math.inf]
 
 
 def test_free_flight_ends_where_contact_begins():

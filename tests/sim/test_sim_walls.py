@@ -7,10 +7,11 @@ import torch
 
 from neuma_lib.errors import NonFiniteError
 from neuma_lib.mechanics.analytic import analytic_law
-from neuma_lib.sim.model import CONDITIONS, MPM, WALLS
+from neuma_lib.sim.colliders import CONTACT_STIFFNESS, contact_radius
+from neuma_lib.sim.model import MPM, WALLS
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
-from tests.support.sim_scenes import DENSITY
+from tests.support.sim_scenes import BOUNDARIES, DENSITY
 
 pytestmark = pytest.mark.core
 
@@ -51,17 +52,20 @@ def largest_error(x: torch.Tensor, start: torch.Tensor) -> float:
 
 
 @pytest.mark.parametrize(
-    "wall, condition, form",
-    [*((wall, "no_slip", "nodes") for wall in WALLS), ("y_min", "slip", "nodes")]
-    + [("y_min", "no_slip", "released")],
+    "wall, condition, contact",
+    [
+        *((wall, "no_slip", contact) for contact in ("particles", "nodes") for wall in WALLS),
+        *(("y_min", "slip", contact) for contact in ("particles", "nodes")),
+        ("y_min", "no_slip", "released"),
+    ],
 )
-def test_a_ball_recovers_its_shape(wall, condition, form):
+def test_a_ball_recovers_its_shape(wall, condition, contact):
     """At rest again, no particle of a soft ball that hit a wall is displaced by more than 1 % of the radius.
 
     Squeezed to half its height it vibrates after the bounce, so it is stopped there and the vibration decays. The
     remaining error is permanent: a tenth of the radius with released walls.
     """
-    model = MPM(24, DT, gravity=WEIGHTLESS, boundary=condition, contact=form)
+    model = MPM(24, DT, gravity=WEIGHTLESS, boundary=condition, contact=contact)
     centre, towards = before(wall, 0.08)
     x0, mass, vol0 = ball(model.grid, centre)
     law = analytic_law(SOFT, dt=DT)
@@ -73,19 +77,20 @@ def test_a_ball_recovers_its_shape(wall, condition, form):
     still = State(aside, torch.zeros(3), mass, vol0, F, torch.zeros_like(F))
     rested = rollout(model, law, still, steps=1000, frames=(1000,), skip_free_flight=False)
     error = largest_error(rested.x[0], x0)
-    assert error < 0.01 * RADIUS if form == "nodes" else error > 0.05 * RADIUS
+    assert error > 0.05 * RADIUS if contact == "released" else error < 0.01 * RADIUS
 
 
-@pytest.mark.parametrize("condition", CONDITIONS)
+@pytest.mark.parametrize("contact, condition", BOUNDARIES)
 @pytest.mark.parametrize("wall", WALLS)
-def test_a_fast_impact_leaves_no_particle_outside(wall, condition):
+def test_a_fast_impact_leaves_no_particle_outside(wall, contact, condition):
     """Launched at 8 m/s, over four times the speed of its shear waves, obliquely into a corner of walls.
 
-    Half a cell beyond the first wall node the velocity is zero, whatever the body does: there a particle sees wall
+    No particle in contact of particles goes more than a quarter of a cell beyond a face. Nodes stop it later: half a
+    cell beyond the first wall node the velocity is zero, whatever the body does: there a particle sees wall
     nodes only. Its distance d from there, in cells, shrinks in a step by d^2 / 2 times the cells that the nearest free
     node moves, so it stays positive.
     """
-    model = MPM(16, DT, gravity=WEIGHTLESS, boundary=condition)
+    model = MPM(16, DT, gravity=WEIGHTLESS, boundary=condition, contact=contact)
     centre, towards = before(wall, 0.05)
     x0, mass, vol0 = ball(model.grid, centre)
     aside = (1 - towards.abs()) * torch.tensor([3.0, 2.0, -2.0])
@@ -95,6 +100,8 @@ def test_a_fast_impact_leaves_no_particle_outside(wall, condition):
     assert (low, high) == (-1.5 * model.dx, 1 + 1.5 * model.dx)
     assert low < path.x.min() and path.x.max() < high
     assert not ((path.x == low) | (path.x == high)).any()
+    if contact == "particles":
+        assert -0.25 * model.dx < path.x.min() and path.x.max() < 1 + 0.25 * model.dx
     if condition != "sticky":
         ahead = (path.x[-1] - 0.5) @ towards
         assert ahead.max() < 0.5
@@ -102,7 +109,7 @@ def test_a_fast_impact_leaves_no_particle_outside(wall, condition):
 
 def test_a_particle_outside_the_grid_is_an_error():
     """The message names a particle whose affine velocity moves a node further than the particle's velocity."""
-    model = MPM(16, DT, gravity=WEIGHTLESS, boundary="sticky")
+    model = MPM(16, DT, gravity=WEIGHTLESS, boundary="sticky", contact="nodes")
     x = torch.tensor([[0.5, 0.5, 0.5], [0.5, -model.dx, 0.5]])
     C = torch.zeros(2, 3, 3)
     # the free node above moves down by five cells, and the particle with an eighth of it
@@ -116,51 +123,81 @@ def test_a_particle_outside_the_grid_is_an_error():
 
 @pytest.mark.parametrize("wall", ["y_min", "x_max"])
 @pytest.mark.parametrize("E, fraction", [(3e4, 0.4), (1e6, 0.2)])
-def test_bodies_rest_at_the_wall_of_the_cube(wall, E, fraction):
-    """The particle next to the wall settles there: a soft ball sinks a third of a cell deep."""
+@pytest.mark.parametrize("contact", ["particles", "nodes"])
+def test_bodies_rest_at_the_wall_of_the_cube(contact, wall, E, fraction):
+    """Half of the fraction of a cell is the depth of the surface with contact of particles.
+
+    With contact of nodes, the fraction is that of the particle next to the wall: a soft ball sinks a third of a cell
+    deep. With contact of particles of mass m and penetrations p_i, the change of momentum is that by the weight M g and
+    the forces of the particles: d(M v)/dt = M g - sum(alpha m p_i / dt^2). A bounce is left after 0.3 s.
+    """
     towards = before(wall, 0.0)[1]
     for grid in (16, 24):
         dt = 0.3 / (grid * math.sqrt(2.5 * E / DENSITY))
-        model = MPM(grid, dt, gravity=tuple(9.8 * towards.tolist()[a] for a in range(3)))
+        model = MPM(grid, dt, gravity=tuple(9.8 * towards.tolist()[a] for a in range(3)), contact=contact)
         x0, mass, vol0 = ball(grid, before(wall, model.free_range[0])[0])
         law = analytic_law({"elasticity": {"name": "fixed_corotated", "E": E, "nu": 0.4}}, dt=dt)
         steps = round(0.6 / dt)
         path = rollout(
             model, law, State(x0, torch.zeros(3), mass, vol0), steps=steps, frames=range(steps // 2, steps)
         )
-        depth = ((path.x - 0.5) @ towards).amax(dim=1) - 0.5
-        assert abs(float(depth.mean())) < fraction * model.dx
+        depth = (path.x - 0.5) @ towards - 0.5
+        if contact == "nodes":
+            assert abs(float(depth.amax(dim=1).mean())) < fraction * model.dx
+            continue
+        penetration = (depth + contact_radius(vol0)).clamp(min=0)
+        assert 0 < float(penetration.amax(dim=1).mean()) < 0.5 * fraction * model.dx
+        impulse = CONTACT_STIFFNESS / dt * float(mass[0] * penetration[:-1].sum())
+        weight = 9.8 * dt * (len(path.x) - 1) * float(mass.sum())
+        gained = float(mass @ ((path.v[-1] - path.v[0]) @ towards))
+        assert gained == pytest.approx(weight - impulse, abs=1e-3 * weight)
 
 
-def bounce(grid: int, E: float = 3e4) -> tuple[float, float]:
-    """Lowest place [cells] of a particle of a falling ball, and height [m] to which its centre rebounds."""
-    model = MPM(grid, DT)
+def bounce(grid: int, contact: str, E: float = 3e4) -> tuple[float, float]:
+    """Lowest place of a falling ball [cells], and height to which its centre rebounds [m].
+
+    The place is that of the surface with contact of particles, and else that of a particle's centre. With contact of
+    particles the time step is a fraction of the cell, because the depth of an impact is proportional to it.
+    """
+    dt = 16 * DT / grid if contact == "particles" else DT
+    model = MPM(grid, dt, contact=contact)
     x0, mass, vol0 = ball(grid, (0.5, RADIUS + 0.15, 0.5))
     state = State(x0, torch.tensor([0.0, -1.92, 0.0]), mass, vol0)
-    law = analytic_law({"elasticity": {"name": "fixed_corotated", "E": E, "nu": 0.45}}, dt=DT)
-    path = rollout(model, law, state, steps=900, frames=range(0, 901, 4))
+    law = analytic_law({"elasticity": {"name": "fixed_corotated", "E": E, "nu": 0.45}}, dt=dt)
+    every = round(4 * DT / dt)
+    path = rollout(model, law, state, steps=225 * every, frames=range(0, 225 * every + 1, every))
     y, v = path.x[..., 1], path.v[..., 1].mean(dim=1)
     up = int((v > 0).int().argmax())
     top = up + int((v[up:] < 0).int().argmax())
-    return float(y[:top].min()) * grid, float(y[top].mean())
+    radius = float(contact_radius(vol0)[0]) if contact == "particles" else 0.0
+    return (float(y[:top].min()) - radius) * grid, float(y[top].mean())
 
 
-def test_coarse_grids_meet_the_same_floor():
+DEEPEST = {"particles": -0.25, "nodes": -0.75}
+"""Bound of the lowest place of `bounce` [cells]."""
+
+
+@pytest.mark.parametrize("contact", DEEPEST)
+def test_coarse_grids_meet_the_same_floor(contact):
     """How deep a body goes below y = 0 is a fraction of a cell, the same at both sizes; the finer one loses less."""
-    (low, height), (lower, higher) = bounce(16), bounce(24)
-    assert -0.75 < low < 0 and abs(low - lower) < 0.05
+    (low, height), (lower, higher) = bounce(16, contact), bounce(24, contact)
+    assert DEEPEST[contact] < low < 0 and abs(low - lower) < 0.05
     assert height < higher
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("E, rate", [(3e4, 1.0), (1e5, 0.5)])
-def test_the_rebound_converges_to_the_same_floor(E, rate):
-    """Twice as fine a grid changes the height less than the doubling before it did, and half as much (first order) for
-    a ball that is not squeezed to half its height. Lowest places are one fraction of a cell, so they go to y = 0.
+@pytest.mark.parametrize(
+    "contact, E, rate",
+    [("particles", 3e4, 1.0), ("particles", 1e5, 1.0), ("nodes", 3e4, 1.0), ("nodes", 1e5, 0.5)],
+)
+def test_the_rebound_converges_to_the_same_floor(contact, E, rate):
+    """Twice as fine a grid changes the height less than the doubling before it did, and with nodes half as much (first
+    order) for a ball that is not squeezed to half its height. Lowest places are one fraction of a cell, so they go to
+    y = 0.
     """
     grids = (16, 24, 32, 48, 64)
-    lows, heights = zip(*(bounce(grid, E) for grid in grids), strict=True)
-    assert max(lows) - min(lows) < 0.06 and -0.75 < min(lows)
+    lows, heights = zip(*(bounce(grid, contact, E) for grid in grids), strict=True)
+    assert max(lows) - min(lows) < 0.06 and DEEPEST[contact] < min(lows)
     assert all(a < b for a, b in zip(heights, heights[1:], strict=False))
     assert heights[4] - heights[2] < rate * (heights[2] - heights[0])
     assert heights[4] - heights[3] < heights[3] - heights[2]

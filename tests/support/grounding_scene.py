@@ -1,4 +1,4 @@
-"""A small grounding problem without files: a soft ball that a camera watches, with its motion known."""
+"""A small grounding problem without files: a soft ball or block that a camera watches, with its motion known."""
 
 from __future__ import annotations
 
@@ -17,9 +17,13 @@ MODEL = MPM(grid=16, dt=2e-3)
 TRUTH = {"elasticity": {"name": "fixed_corotated", "E": 3e4, "nu": 0.3}, "plasticity": {"name": "identity"}}
 PRIOR = {"elasticity": {"name": "fixed_corotated", "E": 1e5, "nu": 0.2}, "plasticity": {"name": "identity"}}
 RADIUS = 0.13
+HEIGHT = 0.28
+"""Of the centre of the ball at the start [m]."""
 
 
-def ball(height: float = 0.3, count: int = 300, n_gaussians: int = 120, seed: int = 0, dtype=torch.float64):
+def ball(
+    height: float = HEIGHT, count: int = 300, n_gaussians: int = 120, seed: int = 0, dtype=torch.float64
+):
     """A ball of particles with coloured Gaussians on and in it."""
     g = torch.Generator().manual_seed(seed)
 
@@ -30,6 +34,23 @@ def ball(height: float = 0.3, count: int = 300, n_gaussians: int = 120, seed: in
             dim=1, keepdim=True
         )
 
+    return _body(inside, 4 / 3 * torch.pi * RADIUS**3, count, n_gaussians, g, dtype)
+
+
+def block(count: int = 300, n_gaussians: int = 120, seed: int = 0, dtype=torch.float64):
+    """A flat block 2 cm above the floor, which slides if it is launched to the side."""
+    g, size = torch.Generator().manual_seed(seed), torch.tensor([0.24, 0.12, 0.24], dtype=torch.float64)
+
+    def inside(n):
+        return torch.tensor([0.4, 0.08, 0.5]) + size * (
+            torch.rand(n, 3, generator=g, dtype=torch.float64) - 0.5
+        )
+
+    return _body(inside, float(size.prod()), count, n_gaussians, g, dtype)
+
+
+def _body(inside, volume, count, n_gaussians, g, dtype):
+    """Particles and coloured Gaussians at the points that `inside` draws."""
     gaussians = Gaussians(
         means=inside(n_gaussians),
         quats=torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).repeat(n_gaussians, 1),
@@ -38,7 +59,6 @@ def ball(height: float = 0.3, count: int = 300, n_gaussians: int = 120, seed: in
         sh0=1.5 * torch.randn(n_gaussians, 1, 3, generator=g, dtype=torch.float64),
         shN=torch.zeros(n_gaussians, 0, 3, dtype=torch.float64),
     )
-    volume = 4 / 3 * torch.pi * RADIUS**3
     particles = inside(count)
     binding, x0, _, vol0 = bind_two_pass(gaussians.means, gaussians.covars(), particles, volume / count)
     return Reconstruction(x0, vol0, 1000 * vol0, gaussians, binding).to(dtype)

@@ -6,11 +6,17 @@ from torch.nn.functional import gelu
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.neural import features, neural_law
 from neuma_lib.mechanics.singular_values import rotation_and_singular_values
+from neuma_lib.sim.model import CONDITIONS
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 
 DENSITY = 1000.0
 DT = 1e-3
+BOUNDARIES = [
+    *(("particles", condition) for condition in ("no_slip", "slip")),
+    *(("nodes", condition) for condition in CONDITIONS),
+]
+"""Ways of contact, and the conditions of a wall that each has."""
 
 
 def law_spec(elasticity, plasticity="identity", E=6e4, nu=0.3, **constants):

@@ -16,7 +16,7 @@ from neuma_lib.sim.state import State
 from neuma_lib.viewer.live import EARTH, FRAME, MAX_SPEED, PIVOT, LiveSimulation, tilted
 from tests.support.sim_scenes import DENSITY, SPECS, cube, make_law
 
-CONSTANTS = {"grid": 16, "boundary": "no_slip", "contact": "nodes"}
+CONSTANTS = {"grid": 16, "boundary": "no_slip", "contact": "particles"}
 DT = 1e-3
 
 

@@ -64,6 +64,7 @@ rule ground_truth:
         dt=time_step,
         frames=frame_steps,
         particles=lambda wildcards: truth_settings(wildcards).particles,
+        stored=SETTINGS.dataset.particles,
         tracers=SETTINGS.dataset.tracers,
         seed=SETTINGS.dataset.seed,
         device=EITHER_DEVICE,

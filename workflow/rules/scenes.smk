@@ -134,8 +134,12 @@ def supplied_world(wildcards):
 
 
 def truth_memory(wildcards):
-    """Memory that a ground truth takes [MB]: twice the particles (x, v, F, C) and tracers of all frames."""
-    bytes_a_frame = 96 * truth_settings(wildcards).particles + 24 * SETTINGS.dataset.tracers
+    """Memory that a ground truth takes [MB]: twice the particles (x, v, F, C) and tracers of all frames.
+
+    The particles of a converged truth are those of a body that fills a twentieth of the cube.
+    """
+    truth = truth_settings(wildcards)
+    bytes_a_frame = 96 * (truth.particles or 8 * truth.grid**3 // 20) + 24 * SETTINGS.dataset.tracers
     return 2000 + 2 * len(frame_steps(wildcards)) * bytes_a_frame // 10**6
 
 

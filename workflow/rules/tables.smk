@@ -48,7 +48,12 @@ def identified_behind(table):
 def with_truths(groups):
     """Scenes with their groups and true laws."""
     return [
-        {"name": name, "group": group, "truth": SETTINGS.scene(name).law.plain()}
+        {
+            "name": name,
+            "group": group,
+            "truth": SETTINGS.scene(name).law.plain(),
+            "converged": SETTINGS.scene_truth(name).grid > SETTINGS.simulation.grid,
+        }
         for name, group in groups.items()
     ]
 

@@ -6,10 +6,12 @@ from workflow.stage import run_script
 
 
 def main(inputs, output, params, run) -> None:
-    law = Prediction(inputs, params.method).law(params.origin["dt"])
+    model = Prediction(inputs, params.method).model(params.origin["dt"])
     measured = {name: inputs.get(name) or None for name in ("metrics", "rollout")}
     known = {**params.origin, "commit": head_commit("."), **measured}
-    about = export_law(output.law, law, page=output.page, **known)
+    if model.exported is not model.law:
+        known["grid"] = None
+    about = export_law(output.law, model.exported, page=output.page, **known)
     run.log(f"{about['kind']}, learned at dt = {about['dt']:g} s")
 
 

@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import torch
+
 from neuma_lib.fitting.frame_batches import first_contact
+from neuma_lib.sim.colliders import contact_radius
 from neuma_lib.sim.model import MPM, WALLS
 from neuma_lib.sim.state import State, Trajectory
 
@@ -37,7 +40,10 @@ def motion_report(
     contact = frames[first] if first < len(frames) else None
     v = (path.v * (start.mass / start.mass.sum())[:, None]).sum(dim=1)
     low, high = model.free_range
-    lowest, highest = path.x.amin(dim=(0, 1)).tolist(), path.x.amax(dim=(0, 1)).tolist()
+    radius = (contact_radius(start.vol0) if model.contact == "particles" else torch.zeros_like(start.vol0))[
+        :, None
+    ]
+    lowest, highest = (path.x - radius).amin(dim=(0, 1)).tolist(), (path.x + radius).amax(dim=(0, 1)).tolist()
     reached = [
         each for pair in zip((x <= low for x in lowest), (x >= high for x in highest)) for each in pair
     ]

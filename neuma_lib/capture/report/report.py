@@ -192,7 +192,7 @@ def _places(rows: Sequence[Mapping[str, Any]], own: str) -> list[dict[str, Any]]
 def _law(identified: Mapping[str, Any], scale: float) -> dict[str, Any]:
     """The identified family, its constants in units of the room, and the losses of all families."""
     constants = []
-    for name, entry in identified["best"]["quantities"].items():
+    for name, entry in identified.get("material", identified["best"])["quantities"].items():
         value, unit = room_value(name, entry["value"], scale)
         prefix, unit = prefixed(value, unit)
         value *= prefix
@@ -202,6 +202,9 @@ def _law(identified: Mapping[str, Any], scale: float) -> dict[str, Any]:
         constants.append(
             {"name": name, "value": text, "interval": interval, "determined": entry["determined"]}
         )
+    if (lowest := identified.get("contact_friction", {}).get("at_least")) is not None:
+        bound = {"value": f"at least {number(lowest)}", "interval": "the body may stick", "determined": False}
+        constants.append({"name": "contact_friction", **bound})
     families = identified["families"]
     known = {name: fit for name, fit in families.items() if "held_out_loss" in fit}
     order = sorted(known, key=lambda name: known[name].get("score", known[name]["held_out_loss"]))

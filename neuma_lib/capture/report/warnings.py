@@ -153,7 +153,7 @@ def constants_warnings(identified: Mapping[str, Any] | None) -> list[str]:
             f"The families {', '.join([identified['family'], *identified['ties']])} explain the video equally "
             "well, so the family of the material is undetermined."
         )
-    best = identified["best"]
+    best = identified.get("material", identified["best"])
     unknown = [name for name, entry in best["quantities"].items() if not entry["determined"]]
     if unknown:
         known = [name for name, entry in best["quantities"].items() if entry["determined"]]

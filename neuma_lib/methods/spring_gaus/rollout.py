@@ -45,8 +45,10 @@ class SpringModel:
             raise InputError(
                 "spring_gaus", "springs touch only the faces of the cube", "Leave this method out"
             )
-        low, high = model.free_range  # half a cell before the walls
-        half = 0.5 * model.dx
+        low, high = model.free_range
+        half = (
+            0.5 * model.dx if model.wall_nodes else 0.0
+        )  # contact of nodes starts half a cell before the wall
         return cls(model.dt, model.gravity, low - half, high + half, substeps)
 
 
