@@ -59,7 +59,7 @@ def evaluate(job: tuple[str, Config, Mapping[str, Any]]) -> dict[str, Any]:
     refined = refined_bodies(name, settings, chosen, body)
     model = simulator(settings, scene)
     before = core_seconds()
-    identified = identify(model, motion, body, video, chosen, prior_of(settings, scene), refined=[refined])
+    identified = identify(model, motion, body, video, chosen, prior_of(settings, scene), refined=refined)
     seconds = core_seconds() - before
     truth = scene.law.plain()
     row = {

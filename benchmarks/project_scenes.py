@@ -72,12 +72,12 @@ def read_body(
 def refined_bodies(
     name: str, settings: Config, chosen: IdentifyConfig, body: Reconstruction
 ) -> list[Reconstruction]:
-    """The body with more particles, for each resampling that the discretisation correction uses."""
+    """The body with more particles for the finer grid, if the settings ask for it."""
+    if not chosen.refined_particles:
+        return []
     mesh = read_mesh(Path(settings.results_root) / name / "mesh.ply")
-    seeds = range(1, 1 + (chosen.resamplings if chosen.refined_particles else 0))
-    clouds = (torch.from_numpy(sample_volume(mesh, chosen.refined_particles, seed)) for seed in seeds)
-    density = settings.scene(name).density
-    return [body.resampled(x, mesh.volume, density, settings.binding) for x in clouds]
+    x = torch.from_numpy(sample_volume(mesh, chosen.refined_particles, 1))
+    return [body.resampled(x, mesh.volume, settings.scene(name).density, settings.binding)]
 
 
 def prior_of(settings: Config, scene: SceneConfig) -> dict[str, Any] | None:

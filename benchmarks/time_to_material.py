@@ -115,7 +115,7 @@ def run(name: str, settings: Config, device: torch.device) -> dict[str, Any]:
         refined = refined_bodies(name, settings, chosen, body)
     prior = prior_of(settings, scene)
     with clock.parts(IDENTIFYING), clock.part("identifying, the rest"):
-        identified = identify(model, motion, body, videos, chosen, prior, refined=[refined])
+        identified = identify(model, motion, body, videos, chosen, prior, refined=refined)
     plain = identified.as_dict()
     options = cases.case(settings, name, METHOD).options
     with clock.part("preparing the correction"):

@@ -32,7 +32,6 @@ WORDS = {
     "thing things": "the name of the object",
     "bring brings brought bringing": "transfer, move, cause",
     "misplaced": "pose_tolerance",
-    "samplings": "resamplings",
     "stock": "published",
     "carrier carriers": "particle_source",
 }

@@ -46,9 +46,6 @@ class IdentifyConfig(Section):
         2, "grid cells and steps of the finer grid, relative to the simulation's", ge=2
     )
     pose_tolerance: float = internal(1e-3, "expected shift [m] and enlargement of the rendered body", ge=0)
-    resamplings: int = internal(
-        2, "bodies with refined particles; their difference enters the uncertainty", ge=1
-    )
     held_out: float = internal(
         0.25, "share of the frames after contact, the last, on which families are compared", gt=0, lt=1
     )

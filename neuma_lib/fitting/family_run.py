@@ -40,8 +40,6 @@ def _squares(residual: Iterable[Tensor]) -> float:
 class FamilyRun:
     """Fit of one family to the first `counts` frames of each video, with residuals and Jacobians for all levels.
 
-    Residuals are those of the finer discretisation where it has been measured, unless `corrected` is false.
-
     Unknowns are the unbounded constants relative to the start of the fit, and the deviations of the initial motion of
     each video. Residuals and their columns are lists over the observations of all videos.
     """
@@ -52,10 +50,10 @@ class FamilyRun:
         videos: Sequence[VideoResiduals],
         counts: Sequence[int],
         settings: IdentifyConfig,
-        corrected: bool = True,
+        fine: bool = False,
     ):
         self.family, self.videos, self.counts, self.settings = family, videos, counts, settings
-        self._corrected = corrected
+        self._fine = fine
         self.alive, self.refined, self.rollouts, self.steps = False, False, 0, 0
         self.fit: Linearisation | None = None
         self._constants = len(family.constants)
@@ -151,21 +149,10 @@ class FamilyRun:
         unsure = [k for v, video in enumerate(self.videos) if video.by_deviation for k in self._unsure(v)]
         return [*range(self._constants), *unsure]
 
-    def measure_discretisation(self, derivatives: bool = False) -> None:
-        """Compute the correction to the finer discretisation, and optionally the derivatives by the deviations, here.
-
-        Other fits need `clear_cache` before they continue.
-        """
+    def differentiate(self) -> None:
+        """Compute the derivatives of the residuals of all videos by the deviations at this fit."""
         for v, video in enumerate(self.videos):
-            here = self._candidate(self._u, v)
-            if derivatives:
-                video.differentiate(here)
-            video.measure_correction(here)
-        self.clear_cache()
-
-    def clear_cache(self) -> None:
-        """Drop cached residuals after a change of the discretisation correction."""
-        self._images = {}
+            video.differentiate(self._candidate(self._u, v))
 
     def score(self) -> FamilyFit:
         """The result of the fit, evaluated on the held-out frames if any."""
@@ -184,14 +171,8 @@ class FamilyRun:
     def _covariance(self) -> np.ndarray:
         """Covariance of all unknowns, to first order."""
         P = self._prior(self.fit)
-        inverse = np.linalg.pinv(self.fit.curvature + P)
-        by_prior = inverse @ P * self._spreads
-        covariance = jackknife(self.fit, P) + by_prior @ by_prior.T
-        for v, video in enumerate(self.videos):
-            if video.spread is not None:
-                by_particles = inverse @ self._slope(v, video.spread)
-                covariance += np.outer(by_particles, by_particles)
-        return covariance
+        by_prior = np.linalg.pinv(self.fit.curvature + P) @ P * self._spreads
+        return jackknife(self.fit, P) + by_prior @ by_prior.T
 
     def inflated_covariance(self) -> np.ndarray:
         """Covariance (k, k) of the constants, inflated along axes where the images change less than linearly predicted.
@@ -291,16 +272,6 @@ class FamilyRun:
         own = zip(self._unsure(v), [each[k] for each in self.videos[v].by_deviation or ()], strict=False)
         return {i: column[:rows] for i, column in (*enumerate(c[at] for c in by_constants), *own)}
 
-    def _slope(self, v: int, residual: Sequence[Tensor]) -> np.ndarray:
-        """J^T r of another residual of a video, shape (k,)."""
-        slope = np.zeros(len(self._u))
-        for at, (video, k, rows) in enumerate(self._places):
-            if video == v:
-                r = self._averaged(at, residual[k][:rows]).double()
-                for i, column in self._columns_of(at).items():
-                    slope[i] += float((self._averaged(at, column) * r).sum())
-        return slope
-
     def _motion(self, v: int, stds: np.ndarray) -> InitialMotion:
         """The fitted initial motion of a video, from the standard deviations of all unknowns."""
         own, motion = self._own(v)[:MOTION], self.videos[v].motion
@@ -359,7 +330,7 @@ class FamilyRun:
             return []
         self.rollouts += len(points) * len(self.videos)
         residuals = [
-            video.residuals([self._candidate(point, v) for point in points], count, self._corrected)
+            video.residuals([self._candidate(point, v) for point in points], count, self._fine)
             for v, (video, count) in enumerate(zip(self.videos, counts or self.counts, strict=True))
         ]
         return [

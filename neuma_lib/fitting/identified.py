@@ -14,9 +14,6 @@ from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.fitting.families import FRICTION, Family
 from neuma_lib.mechanics.combinations import Values, named_combinations, physical
 
-REMAINDER = 0.5
-"""Standard deviation of an extrapolation to dx = 0, relative to its change of the constants."""
-
 
 @dataclass
 class FamilyFit:
@@ -75,17 +72,20 @@ class FamilyFit:
             self.covariance += np.outer(u(shared) - before, u(shared) - before) / (len(ties) + 1)
 
     def extrapolated(self, coarse: FamilyFit, refinement: int) -> FamilyFit:
-        """This fit, of a grid of ``refinement`` times as many cells as another one's, extrapolated to dx = 0.
+        """This fit, of a grid with ``refinement`` times as many cells as that of another fit, extrapolated to dx = 0.
 
-        Unbounded constants are linear functions of dx. The covariance is increased by the square of the extrapolated
-        change, times `REMAINDER` squared.
+        Errors of the unbounded constants decrease with dx (thin limbs, layers near the floor) or with dx^2 (smooth
+        motion). The result lies halfway between the limits that both orders give, and the covariance is increased by
+        the square of the distance to them.
         """
         u = self.family.unbounded
-        change = (u(self.values) - u(coarse.values)) / (refinement - 1)
-        covariance = None
-        if self.covariance is not None:
-            covariance = self.covariance + REMAINDER**2 * np.outer(change, change)
-        return replace(self, values=self.family.bounded(u(self.values) + change), covariance=covariance)
+        change = u(self.values) - u(coarse.values)
+        first, second = (change / (refinement**order - 1) for order in (1, 2))
+        covariance, remainder = self.covariance, (first - second) / 2
+        if covariance is not None:
+            covariance = covariance + np.outer(remainder, remainder)
+        values = self.family.bounded(u(self.values) + (first + second) / 2)
+        return replace(self, values=values, covariance=covariance)
 
     def log_covariance(self, of: Callable[[Values], Values]) -> tuple[list[str], np.ndarray]:
         """Names (m,) and covariance (m, m) of logarithms of positive functions of the constants, to first order."""

@@ -17,9 +17,8 @@ block jackknife over the image and reported for combinations of constants, becau
 purely plastic flow determines the yield stress but not the stiffness. It is increased on plateaus of the loss, and by
 the disagreement of the last frames or of tied families.
 
-The selected family is fitted on two grids. On the finer one, the images are those of the coarse grid plus a correction,
-which is measured at the fit and again after it, so that only the coarse grid needs derivatives. The constants of the
-material follow by a linear extrapolation to a cell size of zero. Those of the coarse grid predict best on that grid.
+The selected family is fitted on two grids. The constants of the material follow by extrapolation to a cell size of zero
+(`FamilyFit.extrapolated`). Those of the coarse grid predict best on that grid.
 
 The Coulomb coefficient of the body and all its obstacles may be a constant of every family. Where the images also admit
 that the body sticks, the result is a lower bound of the coefficient.
@@ -46,9 +45,6 @@ from neuma_lib.mechanics.combinations import Values
 from neuma_lib.sim.model import MPM
 from neuma_lib.splatting.observation import Observation, joint_frames, several
 
-_CORRECTIONS = 2
-"""How often the correction to the finer discretisation is measured again at the fit to it."""
-
 
 def identify(
     model: MPM,
@@ -58,7 +54,7 @@ def identify(
     settings: IdentifyConfig,
     published: Mapping[str, Mapping[str, Any]] | None = None,
     *,
-    refined: Sequence[Sequence[Reconstruction]] = (),
+    refined: Sequence[Reconstruction] = (),
     other_videos: Sequence[tuple[InitialMotion, Reconstruction, Observation | Sequence[Observation]]] = (),
     progress: Callable[[int, int, float], None] | None = None,
     log: Callable[[str], None] = lambda text: None,
@@ -73,7 +69,8 @@ def identify(
             the views of the settings.
         settings: candidates and hyper-parameters.
         published: specification of the law of the scene's prior, an additional start, or None if unknown.
-        refined: for each video, resampled bodies with more particles for a finer grid, if any.
+        refined: for each video, the body with more particles for a finer grid. Without them, constants of the material
+            are not estimated.
         other_videos: initial motion, body and observation of other videos of the same material.
         progress: called with (finished fits, number of fits, mean squared residual).
         log: receives a line for every family.
@@ -98,7 +95,7 @@ def identify(
         raise InputError("identify.contact_friction", *FRICTION_NEEDS)
     families = [Family(name, law.plain(), fits_friction) for name, law in settings.families.items()]
     families.sort(key=lambda family: len(family.constants))  # simpler families provide starts of the others
-    resampled = refined or [()] * len(given)
+    resampled = refined or [None] * len(given)
     videos = [VideoResiduals(model, *one, settings, own) for one, own in zip(given, resampled, strict=True)]
     for video in videos:
         video.hold_out(families[0], settings.held_out)
@@ -115,9 +112,7 @@ def identify(
         _prune(running, settings)
         following = sorted((run for run in running if run.alive), key=lambda run: run.fit.cost)
         if following and level == rounds - 1:
-            following[0].measure_discretisation(derivatives=True)
-            for other in following:
-                other.clear_cache()
+            following[0].differentiate()
         for done, run in enumerate(following):
             run.refine(level)
             if progress:
@@ -130,38 +125,36 @@ def identify(
         )
     selected, ties = _select(list(fits.values()), settings)
     run = next(run for run in running if run.family is selected.family)
-    run.measure_discretisation()
     starts, first = [run.values], rounds - 1
     # If the first frames misled, restart at the coarsest level.
     if selected.held_out > settings.prune_factor * selected.loss:
         starts = [run.values, *(run.family.with_guesses(values) for values in ({}, published_values))]
         first = 0
     counts = [len(video.frames) for video in videos]
-    fine = FamilyRun(run.family, videos, counts, settings)
-    fine.begin(starts, first, run.deviations)
-    for level in range(first + 1, rounds if fine.alive else 0):
-        fine.refine(level)
-    lowest = fine.lowest_friction() if fine.alive else None
+    final = FamilyRun(run.family, videos, counts, settings)
+    final.begin(starts, first, run.deviations)
+    for level in range(first + 1, rounds if final.alive else 0):
+        final.refine(level)
+    lowest = final.lowest_friction() if final.alive else None
     if lowest is not None:
         for video in videos:
             video.set_friction(math.inf)
-        sticking, start = Family(run.family.name, run.family.spec), (fine.values, fine.deviations)
-        fine = FamilyRun(sticking, videos, counts, settings)
-        fine.begin(start[:1], rounds - 1, start[1])
-    tied = [fits[name] for name in ties]
-    if not any(resampled) or not fine.alive:
-        best, material = _final_fit(fine, selected, tied), None
-    else:
-        for _ in range(_CORRECTIONS):
-            fine.measure_discretisation()
+        sticking, start = Family(run.family.name, run.family.spec), (final.values, final.deviations)
+        final = FamilyRun(sticking, videos, counts, settings)
+        final.begin(start[:1], rounds - 1, start[1])
+    tied, material = [fits[name] for name in ties], None
+    if refined and final.alive:
+        final.refine(rounds - 1, closely=True)
+        fine = FamilyRun(final.family, videos, counts, settings, fine=True)
+        fine.begin([final.values], rounds - 1, final.deviations)
+        if fine.alive:
             fine.refine(rounds - 1, closely=True)
-        coarse = FamilyRun(fine.family, videos, counts, settings, corrected=False)
-        coarse.begin([fine.values], rounds - 1, fine.deviations)
-        coarse.refine(rounds - 1, closely=True)
-        best = _final_fit(coarse, selected, tied)
-        material = _final_fit(fine, selected, tied).extrapolated(best, settings.refinement)
-        material.lowest_friction = lowest
+            material = _final_fit(fine, selected, tied)
+    best = _final_fit(final, selected, tied)
     best.lowest_friction = lowest
+    if material is not None:
+        material = material.extrapolated(best, settings.refinement)
+        material.lowest_friction = lowest
     return Identified(
         best,
         ties,

@@ -1,9 +1,8 @@
 """Residuals between simulated and observed images of a launched body, from which constants are identified.
 
 A candidate is a law with deviations of the initial motion and of the position of the rendered body from their
-estimates. A coarse grid and few particles change the apparent material. The difference in the images between a finer
-discretisation and that of the fit can be added to the residuals. The fit then gives the constants of the finer one,
-without its derivatives.
+estimates. A coarse grid and few particles change the apparent material, so a second discretisation, with a finer grid,
+shorter time steps and more particles, may be simulated instead.
 """
 
 from __future__ import annotations
@@ -73,7 +72,6 @@ class VideoResiduals:
         unsure: indices of the deviations that are not fixed to 0.
         by_deviation: derivatives of the residuals of all frames with respect to these deviations, or None if not
             computed. All families share those of one family, because they are mostly kinematic.
-        spread: difference of the residuals of all frames between two sets of refined particles, or None.
         rollouts: number of simulations.
     """
 
@@ -84,7 +82,7 @@ class VideoResiduals:
         body: Reconstruction,
         video: Observation | Sequence[Observation],
         settings: IdentifyConfig,
-        refined: Sequence[Reconstruction] = (),
+        refined: Reconstruction | None = None,
     ):
         observed = [each.select(spread_frames(len(each.frames), settings.frames)) for each in several(video)]
         self.model, self.motion, self.frames, self.weight = model, motion, joint_frames(observed), 1.0
@@ -94,9 +92,7 @@ class VideoResiduals:
             [*motion.std, *[settings.pose_tolerance] * (NUISANCES - MOTION)]
         ).tolist()
         self.by_deviation: list[list[Tensor]] | None = None
-        self.spread: list[Tensor] | None = None
         self.rollouts = 0
-        self._correction: list[Tensor] | None = None
         self._pose_tolerance = settings.pose_tolerance
         self._total, self._axes = settings.covariance_from == "total", observed[0].cameras.viewmats[0, :3, :3]
         self._steps, self._own_frames = rendered_steps(observed), [each.frames for each in observed]
@@ -111,13 +107,11 @@ class VideoResiduals:
             pairs = zip(films, observed, strict=True)
             return _Discretisation(by, body, [Filmed(own, each, *options) for own, each in pairs])
 
-        refined_model = replace(
-            model, grid=settings.refinement * model.grid, dt=model.dt / settings.refinement
-        )
-        self._coarse, self._refined = (
-            discretised(model, body),
-            [discretised(refined_model, each) for each in refined],
-        )
+        self._coarse, self._fine = discretised(model, body), None
+        if refined is not None:
+            factor = settings.refinement
+            fine = replace(model, grid=factor * model.grid, dt=model.dt / factor)
+            self._fine = discretised(fine, refined)
         sizes = [
             [max(1, round(each.cameras.width / across)) for across in settings.pyramid] for each in observed
         ]
@@ -135,7 +129,7 @@ class VideoResiduals:
     def set_friction(self, friction: float) -> None:
         """Set the Coulomb coefficient of all obstacles in the simulations that follow."""
         self.model = self.model.with_friction(friction)
-        for each in (self._coarse, *self._refined):
+        for each in filter(None, (self._coarse, self._fine)):
             each.model = each.model.with_friction(friction)
 
     def counts(self, frames: int) -> list[int]:
@@ -158,19 +152,16 @@ class VideoResiduals:
         self.fitted = held_out_frames(len(self.frames), share, contact=contact)[0]
 
     def residuals(
-        self, candidates: Sequence[Candidate], count: int, corrected: bool = True
+        self, candidates: Sequence[Candidate], count: int, fine: bool = False
     ) -> list[list[Tensor] | None]:
         """Residuals (T, V, H', W', C) of the first ``count`` frames per candidate, None if its rollout diverges.
 
-        They are those of the finer discretisation if ``corrected`` and if `measure_correction` has been called.
+        Args:
+            fine: simulate the refined body on the finer grid.
         """
-        residuals = self._simulated(candidates, count, self._coarse)
-        if self._correction is None or not corrected:
-            return residuals
-        return [
-            None if one is None else [r + a[: len(r)] for r, a in zip(one, self._correction, strict=True)]
-            for one in residuals
-        ]
+        on = self._fine if fine else self._coarse
+        pairs = zip(candidates, self._paths(candidates, count, on), strict=True)
+        return [self._residual(one, path, on.films, count) for one, path in pairs]
 
     def differentiate(self, at: Candidate) -> None:
         """Compute the derivatives by the deviations as forward differences, 0 where a rollout diverges."""
@@ -189,26 +180,6 @@ class VideoResiduals:
                 [torch.zeros_like(r) for r in base] if each is None else _differences(each, base)
                 for each in others
             ]
-
-    def measure_correction(self, at: Candidate) -> None:
-        """Set the correction of all residuals to the finer discretisation, and its uncertainty by the particles."""
-        if not self._refined:
-            return
-        count = len(self.frames)
-        (coarse,), *others = (self._simulated([at], count, each) for each in (self._coarse, *self._refined))
-        fine = [residual for (residual,) in others if residual is not None]
-        if coarse is not None and fine:
-            means = [torch.stack(of_all).mean(0) for of_all in zip(*fine, strict=True)]
-            self._correction = _differences(means, coarse)
-            self.spread = _differences(fine[0], fine[-1]) if len(fine) > 1 else None
-
-    def _simulated(
-        self, candidates: Sequence[Candidate], count: int, on: _Discretisation
-    ) -> list[list[Tensor] | None]:
-        """Residuals of the first ``count`` frames in a discretisation, without correction."""
-        paths = self._paths(candidates, count, on)
-        pairs = zip(candidates, paths, strict=True)
-        return [self._residual(one, path, on.films, count) for one, path in pairs]
 
     def _paths(
         self, candidates: Sequence[Candidate], count: int, on: _Discretisation

@@ -67,11 +67,11 @@ def sees_all(colliders: Sequence[Collider], eyes: np.ndarray, points: np.ndarray
         eyes: shape (E, 3) [m].
         points: shape (n, 3) [m], of which at most `SIGHTS` are used.
     """
-    points = torch.from_numpy(np.asarray(points, float)[:: -(-len(points) // SIGHTS)])
+    seen = torch.from_numpy(np.asarray(points, float)[:: -(-len(points) // SIGHTS)])
     share = torch.linspace(0, 1, SAMPLES, dtype=torch.float64)[:, None, None]
     free = []
     for eye in torch.from_numpy(np.asarray(eyes, float)):
-        x = eye + share * (points - eye)
+        x = eye + share * (seen - eye)
         free.append(all(bool((collider.surface(x)[0] >= 0).all()) for collider in colliders))
     return np.array(free)
 

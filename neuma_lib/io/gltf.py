@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from neuma_lib.geometry.obstacles import Obstacle
@@ -110,7 +111,7 @@ def write_glb(
         partial.write_bytes(struct.pack("<4sII", b"glTF", 2, size) + b"".join(map(bytes, parts)))
 
 
-def linear(srgb: np.ndarray) -> np.ndarray:
+def linear(srgb: ArrayLike) -> np.ndarray:
     """Linear colours from sRGB (IEC 61966-2-1), both in [0, 1]."""
     c = np.clip(np.asarray(srgb, np.float64), 0, 1)
     return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)

@@ -16,7 +16,6 @@ RENAMED = {
     "dataset.sub_frames": "dataset.exposure_samples",
     "identify.particles": "identify.refined_particles",
     "identify.misplaced": "identify.pose_tolerance",
-    "identify.samplings": "identify.resamplings",
     "identify.squares": "identify.pyramid",
     "identify.least_gain": "identify.min_gain",
     "identify.give_up": "identify.prune_factor",

@@ -32,7 +32,7 @@ from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 from neuma_lib.splatting.observation import Observation
 from tests.support.errors import refused
-from tests.support.grounding_scene import MODEL, RADIUS, ball, camera, observe
+from tests.support.grounding_scene import HEIGHT, MODEL, RADIUS, ball, camera, observe
 from tests.support.sim_scenes import law_spec as law
 
 pytestmark = pytest.mark.core
@@ -166,22 +166,24 @@ def test_videos_count_alike_however_long():
 def test_two_grids_give_the_constants_of_the_material():
     """The video is of a body of many particles on a grid three times as fine as that of the fit.
 
-    Constants of the material are closer to the truth than those of the coarse grid alone, whose motion is not changed
-    by the second grid, and another filling of particles makes them less certain.
+    Constants of the material are closer to the truth than those of the coarse grid, which the second grid does not
+    change.
     """
     truth, families = law("hencky", E=3e4, nu=0.35), {"hencky": ELASTIC}
-    generator = torch.Generator().manual_seed(1)
-    few = ball(count=300)
+    body = ball()
+    centre, volume = torch.tensor([0.5, HEIGHT, 0.5], dtype=torch.float64), 4 / 3 * math.pi * RADIUS**3
 
     def filled(count):
-        at = torch.randn(count, 3, generator=generator, dtype=torch.float64)
-        radius = RADIUS * torch.rand(count, 1, generator=generator, dtype=torch.float64) ** (1 / 3)
-        x = torch.tensor([0.5, 0.3, 0.5]) + radius * at / at.norm(dim=1, keepdim=True)
-        return few.resampled(x, float(few.vol0.sum()), 1000.0)
+        """A lattice whose particles, of the radius of contact, end at the surface."""
+        spacing = (volume / count) ** (1 / 3)
+        ticks = torch.arange(-RADIUS, RADIUS, spacing, dtype=torch.float64)
+        x = torch.cartesian_prod(ticks, ticks, ticks)
+        return body.resampled(centre + x[x.norm(dim=1) < RADIUS - spacing / 2], volume, 1000.0)
 
-    many = filled(8000)
-    assert len(many.x0) >= 8000 and float(many.mass.sum()) == pytest.approx(float(few.mass.sum()))
-    finest = replace(MODEL, grid=3 * MODEL.grid, dt=MODEL.dt / 3)
+    coarse = replace(MODEL, grid=24)
+    few, many = filled(1000), filled(16000)
+    assert len(many.x0) > 10000 and float(many.mass.sum()) == pytest.approx(float(few.mass.sum()))
+    finest = replace(coarse, grid=72, dt=MODEL.dt / 3)
     path = rollout(
         finest,
         analytic_law(truth, finest.dt),
@@ -192,22 +194,32 @@ def test_two_grids_give_the_constants_of_the_material():
     cameras = camera(32, few.x0.dtype)
     seen = Observation(FRAMES, many.particle_gs(cameras)(path.x, path.F), cameras)
     options = settings(families, covariance_from="elastic")
-    one, both, two = (
-        identify(MODEL, known(few), few, seen, options, refined=[resampled] if resampled else ())
-        for resampled in ((), (filled(2400),), (filled(2400), filled(2400)))
-    )
+    one = identify(coarse, known(few), few, seen, options)
+    two = identify(coarse, known(few), few, seen, options, refined=[filled(6000)])
     error = {
         name: abs(math.log(fit.values["E"] / 3e4))
         for name, fit in (("alone", one.best), ("grid", two.best), ("material", two.material))
     }
-    print(error, one.best.values, two.best.values, two.material.values, both.material.values)
-    assert one.material is None and error["material"] < error["alone"] / 2
-    assert two.best.values["E"] == pytest.approx(one.best.values["E"], rel=0.05)
-    stds = [np.sqrt(np.diag(fit.material.covariance)) for fit in (both, two)]
-    print(stds)
+    assert one.material is None and error["material"] < error["grid"] / 2
+    assert two.best.values["E"] == pytest.approx(one.best.values["E"], rel=0.02)
     written = two.as_dict()
-    assert written["grid"] == MODEL.grid and written["law"] != written["material"]["law"]
+    assert written["grid"] == 24 and written["law"] != written["material"]["law"]
     assert "of the material" in written["says"]
+
+
+@pytest.mark.parametrize("refinement", [2, 3])
+def test_an_extrapolation_covers_both_orders_of_convergence(refinement):
+    """Errors of log E that are proportional to dx or to dx^2 vanish within a standard deviation, halfway between."""
+    family = Family("hencky", ELASTIC)
+
+    def fit(log_error, covariance=None):
+        return FamilyFit(family, {"E": 1e5 * math.exp(log_error), "nu": 0.3}, covariance=covariance)
+
+    for order in (1, 2):
+        fine = fit(0.1 / refinement**order, 1e-6 * np.eye(2)).extrapolated(fit(0.1), refinement)
+        error, std = math.log(fine.values["E"] / 1e5), math.sqrt(fine.covariance[0, 0] - 1e-6)
+        assert abs(error) == pytest.approx(std, rel=1e-6) and std > 1e-3
+        assert fine.values["nu"] == pytest.approx(0.3) and fine.covariance[1, 1] == pytest.approx(1e-6)
 
 
 def test_a_motion_is_read_moved_and_written():

@@ -141,9 +141,9 @@ def test_problems_of_obstacles_are_named(with_colliders, tmp_path):
     assert not checks.problems(with_colliders(STEP, {"shape": str(file), "size": [0.1]}))
     mesh = {"shape": str(file), "size": [0.4], "centre": [0.5, 0.5, 0.5], "friction": 0.3}
     (collider,) = simulator({"grid": 8, "dt": 1e-3, "contact": "particles", "colliders": [mesh]}).colliders
-    distance, _ = collider.surface(torch.tensor([[0.8, 0.5, 0.5], [0.5, 0.5, 0.4]], dtype=torch.float64))
+    distance, _ = collider.surface(torch.tensor([[0.72, 0.5, 0.5], [0.5, 0.5, 0.4]], dtype=torch.float64))
     # facets are up to 1 % of the radius inside the ball, and distances are those of a grid of 7 mm
-    np.testing.assert_allclose(distance, [0.1, -0.1], atol=0.004)
+    np.testing.assert_allclose(distance, [0.02, -0.1], atol=0.004)
     assert collider.friction == 0.3
 
 

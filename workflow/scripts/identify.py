@@ -35,22 +35,12 @@ def main(inputs, output, params, run) -> None:
             *(listed(inputs[name]) for name in names), params.densities, strict=True
         )
     ]
-    seeds = range(
-        params.seed + 1, params.seed + 1 + (settings.resamplings if settings.refined_particles else 0)
-    )
-    meshes = [read_mesh(file) for file in listed(inputs.mesh)]
-    refined = [
-        [
-            body.resampled(
-                torch.from_numpy(sample_volume(mesh, settings.refined_particles, seed)),
-                mesh.volume,
-                density,
-                binding,
-            )
-            for seed in seeds
-        ]
-        for (_, body, _), mesh, density in zip(videos, meshes, params.densities, strict=True)
-    ]
+    refined = []
+    for (_, body, _), file, density in zip(videos, listed(inputs.mesh), params.densities, strict=True):
+        if settings.refined_particles:
+            mesh = read_mesh(file)
+            x = torch.from_numpy(sample_volume(mesh, settings.refined_particles, params.seed + 1))
+            refined.append(body.resampled(x, mesh.volume, density, binding))
     identification = identify(
         simulator(params.simulation),
         *videos[0],
