@@ -43,7 +43,8 @@ def true_tracers(body, frames, *starts, law=LAW) -> list[torch.Tensor]:
 
 def test_error_of_the_true_law_on_other_particles_is_that_of_sampling():
     particles, tracers = 1500, 500
-    frames = [0, 20, 75, 87, 100]  # in flight, and after the bounces of the true and the stiffer law have separated
+    # In flight, and after the motions under the true and the stiffer law have separated.
+    frames = [0, 20, 75, 87, 100]
     truth, again = true_tracers(
         ball(count=particles, seed=0), frames, in_ball(tracers, 10), in_ball(tracers, 11)
     )

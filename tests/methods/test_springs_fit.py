@@ -88,7 +88,7 @@ def test_gradient_from_springs_to_image_loss(small):
         x, v, _ = spring_rollout(BOX, springs, *small.anchored.start(small.start), small.loss.frames)
         return small.loss(small.anchored.path(small.loss.frames, x, v)).mean()
 
-    # The derivative jumps where an anchor touches the floor a substep earlier: the next such gap is 1e-6 m or less away.
+    # The derivative jumps where an anchor touches the floor a substep earlier: the next one is less than 1e-6 m away.
     check_directional_derivatives(value, parameters, generator, h=1e-7, rel=1e-4, abs=1e-9)
 
 
