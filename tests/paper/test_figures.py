@@ -165,6 +165,13 @@ DATA = {
         row_titles=["video", "Spring-Gaus", "NeuMA"] * 2,
         column_titles=[str(i) for i in range(7)],
     ),
+    "obstacles": lambda: pictures(
+        3,
+        4,
+        {"times": [[f"{150 * i} ms" for i in range(4)]] * 3},
+        row_titles=["JellyStair", "ClayPress", "SandGlass"],
+        column_titles=[""] * 4,
+    ),
     "gradient_analysis": lambda: {
         scene: {
             "norms": {"elastic": curves(50), "plastic": curves(50)},
