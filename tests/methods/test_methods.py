@@ -192,7 +192,7 @@ def test_paths_are_checked_before_they_are_read(tmp_path):
 
 def test_models_together_move_as_consecutive_bodies():
     """Two cubes that meet: one model of both gives the motion of the simulator, bit for bit."""
-    mpm, below, above = MPM(grid=16, dt=DT), cube(height=0.2), cube(height=0.32)
+    mpm, below, above = MPM(grid=16, dt=DT), cube(height=0.1), cube(height=0.22)
     both = State(
         *(torch.cat([getattr(s, name) for s in (below, above)]) for name in ("x", "v", "mass", "vol0"))
     )
