@@ -62,7 +62,7 @@ def test_segments_do_not_change_the_gradient(cache_bytes):
     path, actual = gradients(model, law, start, memory=memory, **options)
     workspace = path.x.grad_fn.simulation.workspace
     assert workspace.size.n_checkpoints == segments
-    buffers = (*workspace.carried, *workspace.checkpoints)
+    buffers = (*workspace.states, *workspace.checkpoints)
     buffers += (workspace.tau, workspace.F_trial, workspace.grid, workspace.grid_v)
     assert 0.9 * memory < sum(buffer.nbytes for buffer in buffers) <= memory
     for one, other in zip(actual, expected, strict=True):
