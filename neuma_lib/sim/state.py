@@ -154,7 +154,7 @@ class Trajectory:
         C: APIC affine velocities [1/s], shape (T, N, 3, 3).
         tracers: positions of passive tracers [m], shape (T, M, 3), or None.
         F_total: total deformation gradients, elastic and plastic, shape (T, N, 3, 3), or None.
-        stuck: tangential displacements of particles that stick [m], shape (T, N, 3), or None without contact of particles.
+        stuck: tangential displacements of particles that stick [m], shape (T, N, 3), None unless particles touch.
     """
 
     frames: tuple[int, ...]
