@@ -287,8 +287,7 @@ def from_frame(start: State, loss: TrajectoryLoss, path: Trajectory, first: int)
     """A video from the frame with index ``first`` on, which starts from the state of a path at the previous frame or
     earlier, before all steps of the remaining exposures.
 
-    The steps before a contact do not depend on the law, so they are simulated once and have no gradient. With contact
-    of particles that state must not be in contact: the displacement of friction (`Collider`) is not part of it.
+    The steps before a contact do not depend on the law, so they are simulated once and have no gradient.
     """
     if first == 0:
         return start, loss
@@ -297,8 +296,7 @@ def from_frame(start: State, loss: TrajectoryLoss, path: Trajectory, first: int)
     if not before:
         return start, rest
     at = before[-1]
-    state = State(path.x[at], path.v[at], start.mass, start.vol0, path.F[at], path.C[at])
-    return state, rest.later(path.frames[at])
+    return start.after(path, at), rest.later(path.frames[at])
 
 
 def _select(

@@ -30,7 +30,7 @@ def free_flight_steps(
         v = v.expand_as(x).unflatten(0, (copies, -1))
         if not (v == v[:, :1]).all():
             return 0
-        if not (F == torch.eye(3, dtype=F.dtype, device=F.device)).all() or C.any():
+        if not (F == torch.eye(3, dtype=F.dtype, device=F.device)).all() or C.any() or state.stuck.any():
             return 0
         clear = _clear_steps(model, x.unflatten(0, (copies, -1)), v[:, :1], state.vol0.max(), last)
         if clear and not all(_at_rest(model, region, state, len(x) // copies) for region in regions):
@@ -87,9 +87,16 @@ def _at_rest(model: MPM, region: MaterialRegion, state: State, copy: int) -> boo
 
 
 def ballistic(
-    model: MPM, start: tuple[Tensor, ...], tracers: Tensor | None, frames: Sequence[int]
+    model: MPM,
+    start: tuple[Tensor, ...],
+    more: Sequence[str],
+    tracers: Tensor | None,
+    frames: Sequence[int],
 ) -> Trajectory:
-    """Free flight: x_n = x0 + n dt v0 + g dt^2 n (n + 1) / 2, v_n = v0 + n dt g."""
+    """Free flight: x_n = x0 + n dt v0 + g dt^2 n (n + 1) / 2, v_n = v0 + n dt g.
+
+    ``start`` is (x, v, F, C) and the parts named in ``more``, which do not change.
+    """
     x0, v0, *constant = start
     T = len(frames)
     n = torch.tensor(frames, dtype=torch.float64)[:, None, None]
@@ -99,7 +106,7 @@ def ballistic(
         for t in (model.dt**2 * n * (n + 1) / 2 * gravity, model.dt * n * gravity)
     )
     elapsed = (model.dt * n).to(dtype=x0.dtype, device=x0.device)
-    F, C, *F_total = (value.expand(T, *value.shape) for value in constant)
+    F, C, *rest = (value.expand(T, *value.shape) for value in constant)
     return Trajectory(
         tuple(frames),
         x0 + (elapsed * v0 + fall),
@@ -107,5 +114,5 @@ def ballistic(
         F,
         C,
         None if tracers is None else tracers + (elapsed * v0[0] + fall).detach(),
-        *F_total,
+        **dict(zip(more, rest, strict=True)),
     )

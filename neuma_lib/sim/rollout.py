@@ -1,7 +1,8 @@
 """Entry point of the simulator.
 
 For autograd a rollout is one function from (x, v, F, C, weights of the laws) to the states at the frames, whose
-gradient is one reverse loop over the stored states. The total deformation is an optional fifth part of the state.
+gradient is one reverse loop over the stored states. The total deformation and, with contact of particles, the
+displacements of friction are further parts of the state.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ def rollout(
 ) -> Trajectory:
     """Simulate particles and return their states at the frames (paper Eq. 1).
 
-    Differentiable with respect to the weights of the laws and to x, v, F and C of the state. Masses, volumes and
+    Differentiable with respect to the weights of the laws and to x, v, F, C and stuck of the state. Masses, volumes and
     tracers have no gradient.
 
     Args:
@@ -155,14 +156,17 @@ def fly_and_simulate(
     first is raised.
     """
     first = free_flight_steps(model, regions, state, frames[-1], copies) if skip_free_flight else 0
-    start = (*state.motion, state.F) if total else state.motion
+    more = {"F_total": state.F} if total else {}
+    if model.contact == "particles":
+        more["stuck"] = state.stuck
+    start = (*state.motion, *more.values())
     in_flight = sum(n < first for n in frames)
-    flight = ballistic(model, start, tracers, frames[:in_flight]) if in_flight else None
+    flight = ballistic(model, start, tuple(more), tracers, frames[:in_flight]) if in_flight else None
     frames = frames[in_flight:]
     if flight is not None and not frames:
         return flight, [None] * copies
     if first:
-        landed = ballistic(model, start, tracers, (first,))
+        landed = ballistic(model, start, tuple(more), tracers, (first,))
         start = (landed.x[0], landed.v[0], *start[2:])
         tracers = None if landed.tracers is None else landed.tracers[0]
     x, steps, plan = state.x, frames[-1] - first, None
@@ -176,7 +180,7 @@ def fly_and_simulate(
         model, regions, slices, state, steps, first, plan, scatter, total, copies, frictions
     )
     *states, seen = RolloutFunction.apply(simulation, [n - first for n in frames], tracers, *inputs)
-    path = Trajectory(frames, *states[:4], tracers=seen, F_total=states[4] if total else None)
+    path = Trajectory(frames, *states[:4], tracers=seen, **dict(zip(more, states[4:], strict=True)))
     return path if flight is None else flight.followed_by(path), simulation.errors
 
 

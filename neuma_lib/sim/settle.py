@@ -58,7 +58,7 @@ def settle(
         ramped, energy, calm = replace(still, gravity=gravity), 0.0, 0
         while calm < quiet:
             path = rollout(ramped, law, state, steps=every, frames=(every,), skip_free_flight=False)
-            state = replace(state, x=path.x[0], v=path.v[0], F=path.F[0], C=path.C[0])
+            state = state.after(path)
             taken, before = taken + every, energy
             energy = float(state.mass @ state.v.square().sum(dim=1))
             speed = float(state.v.norm(dim=1).max())

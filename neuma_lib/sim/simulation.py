@@ -116,7 +116,7 @@ class Simulation:
         frames: Sequence[int],
         tracers: Tensor | None = None,
     ) -> tuple[Tensor | None, ...]:
-        """Run all steps from ``start`` (x, v, F, C and optionally F_total) and return these and tracers at the frames.
+        """Run all steps from ``start`` (`Workspace.states`) and return these and tracers at the frames.
 
         Raises:
             NonFiniteError: every copy diverged. If only some did, `errors` has their errors.
@@ -126,7 +126,6 @@ class Simulation:
         result = tuple(value.new_empty(len(frames), *value.shape) for value in start)
         for state, value in zip(states, start, strict=True):
             state[0].copy_(value)
-        ws.stuck[0].zero_()
         if self._uses_graphs:
             ws.load_weights(weights)
             weights = ws.weights
@@ -135,9 +134,9 @@ class Simulation:
         self._copy_frames(0, [0], frames, result)
         last = 0  # index of the last state of the previous segment
         for index, (first, steps) in enumerate(self._segments(frames)):
-            for state in ws.carried if last else ():
+            for state in states if last else ():
                 state[0].copy_(state[last])
-            for checkpoint, state in zip(ws.checkpoints, ws.carried, strict=True):
+            for checkpoint, state in zip(ws.checkpoints, ws.states, strict=True):
                 if len(checkpoint):
                     checkpoint[index].copy_(state[0])
             ws.load_poses(self.first + first, steps)
@@ -176,12 +175,12 @@ class Simulation:
         else:
             grad_weights = [torch.zeros_like(w) for w in weights]
         totals = ws.grad_states
-        for total in (*ws.grad_carried, *grad_weights):
+        for total in (*totals, *grad_weights):
             total.zero_()
         for index, (first, steps) in reversed(list(enumerate(self._segments(frames)))):
             ws.load_poses(self.first + first, steps)
             if index != self._segment_in_memory:
-                for checkpoint, state in zip(ws.checkpoints, ws.carried, strict=True):
+                for checkpoint, state in zip(ws.checkpoints, ws.states, strict=True):
                     state[0].copy_(checkpoint[index])
                 self._launch(("forward", steps), lambda steps=steps: self._advance(steps, weights))
                 self._segment_in_memory = index

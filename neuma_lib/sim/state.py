@@ -24,6 +24,7 @@ class State:
         F: elastic deformation gradients, shape (N, 3, 3), by default the identity.
         C: APIC affine velocities [1/s], shape (N, 3, 3), by default zero.
         clamp: index of the clamp that holds each particle, or -1, shape (N,), by default from the positions.
+        stuck: tangential displacements since particles stick to a `Collider` [m], shape (N, 3), by default zero.
 
     Raises:
         InputError: shapes, precisions or devices do not match, or a value is not finite or a mass or volume not
@@ -37,6 +38,7 @@ class State:
     F: Tensor = None  # type: ignore[assignment]
     C: Tensor = None  # type: ignore[assignment]
     clamp: Tensor | None = None
+    stuck: Tensor = None  # type: ignore[assignment]
 
     def __post_init__(self):
         x = self.x
@@ -50,8 +52,10 @@ class State:
             object.__setattr__(self, "F", eye)
         if self.C is None:
             object.__setattr__(self, "C", torch.zeros_like(eye))
+        if self.stuck is None:
+            object.__setattr__(self, "stuck", torch.zeros_like(x))
         shapes = {"x": [(N, 3)], "v": [(N, 3), (3,)], "mass": [(N,)], "vol0": [(N,)]}
-        for name, allowed in (shapes | {"F": [(N, 3, 3)], "C": [(N, 3, 3)]}).items():
+        for name, allowed in (shapes | {"F": [(N, 3, 3)], "C": [(N, 3, 3)], "stuck": [(N, 3)]}).items():
             value = getattr(self, name)
             if tuple(value.shape) not in allowed:
                 expected = " or ".join(map(str, allowed))
@@ -102,15 +106,24 @@ class State:
     def joined(cls, bodies: Sequence[State]) -> State:
         """Concatenate the particles of several bodies."""
         x, v, F, C = (torch.cat(parts) for parts in zip(*(body.motion for body in bodies), strict=True))
-        mass, vol0 = (torch.cat([getattr(body, name) for body in bodies]) for name in ("mass", "vol0"))
+        mass, vol0, stuck = (
+            torch.cat([getattr(body, name) for body in bodies]) for name in ("mass", "vol0", "stuck")
+        )
         clamps = [body.clamp for body in bodies if body.clamp is not None]
         if clamps and len(clamps) < len(bodies):
             raise InputError("state.clamp", "must be given for all joined bodies or for none")
-        return cls(x, v, mass, vol0, F, C, torch.cat(clamps) if clamps else None)
+        return cls(x, v, mass, vol0, F, C, torch.cat(clamps) if clamps else None, stuck)
+
+    def after(self, path: Trajectory, frame: int = -1) -> State:
+        """The state at the frame of this index of a trajectory, from which a simulation continues exactly."""
+        names = ("x", "v", "F", "C", *(["stuck"] if path.stuck is not None else []))
+        return replace(self, **{name: getattr(path, name)[frame] for name in names})
 
     def to(self, device: torch.device | str) -> State:
         """Copy to another device."""
-        moved = {name: getattr(self, name).to(device) for name in ("x", "v", "mass", "vol0", "F", "C")}
+        moved = {
+            name: getattr(self, name).to(device) for name in ("x", "v", "mass", "vol0", "F", "C", "stuck")
+        }
         return State(**moved, clamp=None if self.clamp is None else self.clamp.to(device))
 
     @property
@@ -141,6 +154,7 @@ class Trajectory:
         C: APIC affine velocities [1/s], shape (T, N, 3, 3).
         tracers: positions of passive tracers [m], shape (T, M, 3), or None.
         F_total: total deformation gradients, elastic and plastic, shape (T, N, 3, 3), or None.
+        stuck: tangential displacements of particles that stick [m], shape (T, N, 3), None unless particles touch.
     """
 
     frames: tuple[int, ...]
@@ -150,6 +164,7 @@ class Trajectory:
     C: Tensor
     tracers: Tensor | None = None
     F_total: Tensor | None = None
+    stuck: Tensor | None = None
 
     def at(self, frames: Sequence[int]) -> Trajectory:
         """The states at some of the frames. Frames after the last one repeat it.

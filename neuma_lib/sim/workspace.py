@@ -65,9 +65,8 @@ class Workspace:
         x, v: positions [m] and velocities [m/s], shape (n_states, N, 3).
         C, F: affine velocities [1/s] and elastic deformation gradients, shape (n_states, N, 3, 3).
         F_total: total deformation gradients, shape (n_states, N, 3, 3), if the state includes them.
-        states: x, v, F, C and optionally F_total; grad_states: their gradients.
         stuck: tangential displacements of particles in contact [m], shape (n_states, N, 3), see `Collider`.
-        carried: states, and `stuck` with contact of particles; grad_carried: their gradients.
+        states: x, v, F, C, optionally F_total, and stuck with contact of particles; grad_states: their gradients.
         tau, F_trial: Kirchhoff stresses [Pa] and trial deformation gradients, shape (n_cached_steps, N, 3, 3).
         grid: momentum [kg m/s] and mass [kg] of the nodes, shape (n_cached_steps, copies * nodes^3, 4).
         grid_v: velocity [m/s] of the nodes and 1 where there is mass, shape (n_cached_steps, copies * nodes^3, 4).
@@ -108,7 +107,8 @@ class Workspace:
             self.F_total = self._buffer((states, N), "mat33")
             self.states += (self.F_total,)
         self.stuck = self._buffer((states, N) if self._contact else (1, 1), "vec3")
-        self.carried = (*self.states, self.stuck) if self._contact else self.states
+        if self._contact:
+            self.states += (self.stuck,)
         self.tau, self.F_trial = self._buffer((cached, N), "mat33"), self._buffer((cached, N), "mat33")
         self.grid, self.grid_v = self._buffer((cached, nodes), "vec4"), self._buffer((cached, nodes), "vec4")
         self.mass, self.vol0, self.radius = (self._buffer((N,), "real") for _ in range(3))
@@ -125,7 +125,7 @@ class Workspace:
         self.held_mass, self.held_by = self._buffer((held,), "real"), self._buffer((held,), dtype=torch.int32)
         self.faults = self._buffer((size.copies, 3), dtype=torch.int64)
         self.checkpoints = tuple(
-            value.new_empty(size.n_checkpoints, *value.shape[1:]) for value in self.carried
+            value.new_empty(size.n_checkpoints, *value.shape[1:]) for value in self.states
         )
         self.sorts = size.scatter != "atomic"
         n_sorts = -(-max(states - 1, 1) // SORT_EVERY) if self.sorts and size.differentiable else 1
@@ -143,7 +143,8 @@ class Workspace:
                 self.grad_F_total = self._buffer((N,), "mat33")
                 self.grad_states += (self.grad_F_total,)
             self.grad_stuck = self._buffer((N if self._contact else 1,), "vec3")
-            self.grad_carried = (*self.grad_states, self.grad_stuck)
+            if self._contact:
+                self.grad_states += (self.grad_stuck,)
             self.grad_grid = self._buffer((2, nodes), "vec4")
             self._record_adjoint()
 

@@ -234,10 +234,11 @@ class LiveSimulation:
         reached = min(max(height, 0.0), max(highest, 0.0))
         lifted[:, 1] += reached - low
         state, rest = self._state, _undeformed(lifted)
-        old = (state.x, state.v.expand_as(state.x), state.F, state.C, self._total)
-        x, v, F, C, total = (array.clone() for array in old)
-        x[own], v[own], F[own], C[own], total[own] = lifted, 0.0, rest, 0.0, rest
-        self._state, self._total, self._hand = replace(state, x=x, v=v, F=F, C=C), total, None
+        old = (state.x, state.v.expand_as(state.x), state.F, state.C, state.stuck, self._total)
+        x, v, F, C, stuck, total = (array.clone() for array in old)
+        x[own], v[own], F[own], C[own], stuck[own], total[own] = lifted, 0.0, rest, 0.0, 0.0, rest
+        self._state = replace(state, x=x, v=v, F=F, C=C, stuck=stuck)
+        self._total, self._hand = total, None
         if len(self._counts) == 1:
             self._trouble = None  # the diverged state is gone
         if height > reached:
@@ -262,7 +263,7 @@ class LiveSimulation:
             raise InputError("add", "there is no room above the other bodies", "Reset, or wait")
         shift = 0.5 - 0.5 * (low + high)
         shift[1] = floor - low[1]
-        added = replace(body, x=body.x + shift, v=torch.zeros_like(body.x), F=None, C=None)
+        added = replace(body, x=body.x + shift, v=torch.zeros_like(body.x), F=None, C=None, stuck=None)
         self._state = State.joined([self._state, added])
         self._total = torch.cat([self._total, _undeformed(body.x)])
         self._counts, self._laws = [*self._counts, len(body.x)], [*self._laws, law]
@@ -371,13 +372,12 @@ class LiveSimulation:
         )
 
     def _take(self, path: Trajectory) -> None:
-        x, v, F, C, total = (value[-1] for value in (path.x, path.v, path.F, path.C, path.F_total))
-        for name, value in (("position", x), ("velocity", v), ("deformation", F)):
-            if not value.isfinite().all():
+        for name, value in (("position", path.x), ("velocity", path.v), ("deformation", path.F)):
+            if not value[-1].isfinite().all():
                 raise NonFiniteError("live", f"a {name} is not finite")
         # the total deformation of the rollout starts from the initial F
-        self._total = total @ torch.linalg.solve(self._state.F, self._total)
-        self._state = replace(self._state, x=x, v=v, F=F, C=C)
+        self._total = path.F_total[-1] @ torch.linalg.solve(self._state.F, self._total)
+        self._state = self._state.after(path)
 
     def _measure(self) -> None:
         """Update running means of real and simulated time per frame. Frame rate and pace are ratios of these means,

@@ -104,7 +104,7 @@ def test_videos_count_alike_however_long(problem):
 
 
 def test_one_law_fits_two_videos(problem):
-    other = video_of(problem[0], torch.tensor([0.4, -0.8, 0.1], dtype=torch.float64), FRAMES)
+    other = video_of(problem[0], torch.tensor([0.4, -1.1, 0.1], dtype=torch.float64), FRAMES)
     both = train(problem, other_videos=[other])
 
     def loss_of(law, start, loss):

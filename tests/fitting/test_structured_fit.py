@@ -289,17 +289,15 @@ def test_held_out_frames_end_each_block_after_the_contact(blocks, count, share, 
         assert end - 1 in held_out and start not in held_out
 
 
-@pytest.mark.parametrize("first", [0, 1, 3])
+@pytest.mark.parametrize("first", [0, 1, 3, 5])
 def test_a_video_from_a_frame_on_is_the_rest_of_the_whole(first):
-    """Of a spinning ball, which is strained before contact, up to the frame of first contact.
-
-    No later one: friction depends on where a particle began to stick, which is not part of a state.
-    """
+    """Of a spinning ball, which is strained before contact, from before and within contact, where particles stick."""
     body, frames = ball(), (0, 20, 40, 50, 60, 80)
     start = body.state(V0, torch.tensor([2.0, -3.0, 4.0], dtype=torch.float64))
     law = structured_law(FLOWS, MODEL.dt).double()
     path = rollout(MODEL, law, start, steps=frames[-1], frames=frames, total=True)
     assert first_contact(MODEL, path.x, body.vol0) == 3 and (path.F[2] - torch.eye(3)).abs().max() > 1e-3
+    assert path.stuck is not None and path.stuck[4].any() and not path.stuck[2].any()
     whole = PixelLoss(body, observe(body, V0, frames))
     later, rest = from_frame(start, whole, path, first)
     before = frames[first - 1] if first else 0

@@ -62,11 +62,29 @@ def test_segments_do_not_change_the_gradient(cache_bytes):
     path, actual = gradients(model, law, start, memory=memory, **options)
     workspace = path.x.grad_fn.simulation.workspace
     assert workspace.size.n_checkpoints == segments
-    buffers = (*workspace.carried, *workspace.checkpoints)
+    buffers = (*workspace.states, *workspace.checkpoints)
     buffers += (workspace.tau, workspace.F_trial, workspace.grid, workspace.grid_v)
     assert 0.9 * memory < sum(buffer.nbytes for buffer in buffers) <= memory
     for one, other in zip(actual, expected, strict=True):
         assert torch.equal(one, other)
+
+
+@pytest.mark.parametrize("name", ["box", "sticking"])
+def test_a_rollout_in_two_parts_is_the_whole(name):
+    """States and gradients, also if the second part starts inside contact, in stick and in slip."""
+    model, start = falling_on(COLLIDERS[name])
+    law = make_law("von_mises")
+    whole, expected = gradients(model, law, start, total=False)
+    own = replace(start, x=start.x.clone().requires_grad_(), v=start.v.clone().requires_grad_())
+    first = rollout(model, law, own, steps=30, frames=(FRAMES[0], 30))
+    between = own.after(first)
+    assert touches(model, first, start) and between.stuck.any()
+    second = rollout(model, law, between, steps=FRAMES[1] - 30, frames=(FRAMES[1] - 30,))
+    joined = first.at(FRAMES[:1]).followed_by(second)
+    for part in ("x", "v", "F", "C", "stuck"):
+        torch.testing.assert_close(getattr(joined, part), getattr(whole, part), rtol=0, atol=1e-12)
+    for one, other in zip(torch.autograd.grad(loss_of(joined), (own.x, own.v)), expected, strict=True):
+        assert (one - other).abs().max() < 1e-9 * other.abs().max()
 
 
 @pytest.mark.parametrize("name", ["moving", "sticking"])

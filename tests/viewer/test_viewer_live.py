@@ -77,7 +77,7 @@ def test_it_simulates_what_a_rollout_does(live):
 def test_colliders_move_on_from_frame_to_frame(live):
     """A lift rises through the body, and lifts it as in one rollout."""
     moving = {"velocity": (0.0, 1.0, 0.0), "spin": (0.0, 1.0, 0.0)}
-    lift = Collider("box", (0.4, 0.02, 0.4), (0.5, 0.05, 0.5), friction=0.0, **moving)
+    lift = Collider("box", (0.4, 0.02, 0.4), (0.5, 0.05, 0.5), **moving)
     constants = {"grid": 16, "contact": "particles", "colliders": (lift,)}
     result = reached(live(constants=constants, height=0.21), lambda s: s.time > 0.06)
     steps = round(result.time / DT)

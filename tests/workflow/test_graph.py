@@ -20,7 +20,7 @@ EVERYTHING = ("tables", "figures", "videos", f"{SUPERVISED}/image_metrics.json",
 # Blender films the truth, evaluation measures against it; figures and viewer show it.
 MAY_READ_THE_TRUTH = {
     *("render_static", "render_dynamic", "initial_state", "tracers", "evaluate", "viewer"),
-    *("particles_app", "lora_alphav", "ext_time"),
+    *("particles_app", "lora_alphav", "ext_time", "obstacles"),
 }
 COMPARED = [f"{RESULTS}/figures/{name}.png" for name in ("main_res", "image_quality", "ch_dist_curve")]
 LAWS = [

@@ -64,7 +64,7 @@ rule ground_truth:
         dt=time_step,
         frames=frame_steps,
         particles=lambda wildcards: truth_settings(wildcards).particles,
-        stored=SETTINGS.dataset.particles,
+        stored=lambda wildcards: None if truth_settings(wildcards).particles else SETTINGS.dataset.particles,
         tracers=SETTINGS.dataset.tracers,
         seed=SETTINGS.dataset.seed,
         device=EITHER_DEVICE,
