@@ -43,7 +43,7 @@ class DatasetConfig(Section):
         None,
         description="grid cells of the ground truth along each side; null: simulation.grid; converged: the least "
         "even multiple of simulation.grid from 96, with a time step refined by the same factor, 8 particles in a "
-        "cell, and an estimate of the change that a doubled grid would make",
+        "cell, and, unless truth.particles is given, an estimate of the change that a doubled grid would make",
     )
     dt: float | None = Field(
         None,
