@@ -210,7 +210,7 @@ def test_gradients_of_copies_are_those_of_each(models):
         plan = MemoryPlan(FRAMES[-1], True, 0)
         options = dict(plan=plan, copies=len(models), frictions=frictions)
         simulation = Simulation(models[0], bodies, slices, state, FRAMES[-1], **options)
-        start = [value.clone().requires_grad_() for value in state.motion]
+        start = [value.clone().requires_grad_() for value in (*state.motion, state.stuck)]
         x, *_ = RolloutFunction.apply(simulation, FRAMES, None, *start, *weights)
         return torch.autograd.grad(x[-1].square().sum(), start[:2])
 
