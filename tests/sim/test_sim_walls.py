@@ -62,8 +62,9 @@ def largest_error(x: torch.Tensor, start: torch.Tensor) -> float:
 def test_a_ball_recovers_its_shape(wall, condition, contact):
     """At rest again, no particle of a soft ball that hit a wall is displaced by more than 1 % of the radius.
 
-    On a wall without friction, contact of particles leaves 1.9 % (1.6 % on 36^3). Squeezed to half its height it vibrates after the bounce, so it is stopped there and the vibration decays. The
-    remaining error is permanent: a tenth of the radius with released walls.
+    On a wall without friction, contact of particles leaves 1.9 % (1.6 % on 36^3). Squeezed to half its height it
+    vibrates after the bounce, so it is stopped there and the vibration decays. The remaining error is permanent: a
+    tenth of the radius with released walls.
     """
     model = MPM(24, DT, gravity=WEIGHTLESS, boundary=condition, contact=contact)
     centre, towards = before(wall, 0.08)
