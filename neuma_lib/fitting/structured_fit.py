@@ -142,8 +142,10 @@ def train_structured(
     if any(result is None for result in simulated):
         raise NonFiniteError("material", "the simulation with the uncorrected law diverges")
     paths = [path for path, _ in simulated]
-    firsts = [
-        first_informative_frame(
+    firsts = [  # a simulation that starts later would have moving obstacles at other times
+        0
+        if model.changes
+        else first_informative_frame(
             len(loss.frames), first_contact(model, path.at(loss.frames).x, own.vol0, loss.frames)
         )
         for (own, loss), path in zip(videos, paths, strict=True)

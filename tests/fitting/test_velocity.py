@@ -141,7 +141,7 @@ def test_uncertainty_covers_the_error_of_noisy_images(correlated):
     """Independent noise, and patches of 8 px that stay where they are over all frames.
 
     The root mean square of 8 independent errors of one standard deviation is below 0.2 or above 3 with a probability
-    of 1e-5 (chi-squared distribution). Of 4 errors it would be 3e-3, for each of the unknowns.
+    of 2.4e-5 (chi-squared distribution). Of 4 errors it would be 3e-3, for each of the unknowns.
     """
     body = ball()
     v0 = np.array([0.5, -1.2, 0.4])
