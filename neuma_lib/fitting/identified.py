@@ -75,17 +75,16 @@ class FamilyFit:
         """This fit, of a grid with ``refinement`` times as many cells as that of another fit, extrapolated to dx = 0.
 
         Errors of the unbounded constants decrease with dx (thin limbs, layers near the floor) or with dx^2 (smooth
-        motion). The result lies halfway between the limits that both orders give, and the covariance is increased by
-        the square of the distance to them.
+        motion). The result is the limit of second order. Its covariance is increased by the square of the distance to
+        the limit of first order.
         """
         u = self.family.unbounded
         change = u(self.values) - u(coarse.values)
         first, second = (change / (refinement**order - 1) for order in (1, 2))
-        covariance, remainder = self.covariance, (first - second) / 2
+        covariance, remainder = self.covariance, first - second
         if covariance is not None:
             covariance = covariance + np.outer(remainder, remainder)
-        values = self.family.bounded(u(self.values) + (first + second) / 2)
-        return replace(self, values=values, covariance=covariance)
+        return replace(self, values=self.family.bounded(u(self.values) + second), covariance=covariance)
 
     def log_covariance(self, of: Callable[[Values], Values]) -> tuple[list[str], np.ndarray]:
         """Names (m,) and covariance (m, m) of logarithms of positive functions of the constants, to first order."""
@@ -153,7 +152,7 @@ class Identified:
     Attributes:
         best: the selected family, fitted to all frames on the grid of the simulation. It predicts on that grid.
         ties: names of other families with an equal score.
-        fits: all candidates at their evaluation, by name.
+        fits: all candidates at their evaluation, by name, on the finer grid where families were compared there.
         frames: steps of the fitted frames of each video.
         held_out: steps of the held-out frames of each video.
         rollouts: number of simulations, some of which families share.

@@ -17,8 +17,10 @@ block jackknife over the image and reported for combinations of constants, becau
 purely plastic flow determines the yield stress but not the stiffness. It is increased on plateaus of the loss, and by
 the disagreement of the last frames or of tied families.
 
-The selected family is fitted on two grids. The constants of the material follow by extrapolation to a cell size of zero
-(`FamilyFit.extrapolated`). Those of the coarse grid predict best on that grid.
+On a coarse grid, most of the loss is discretisation error, which may hide the family. With a refined body, families of
+similar scores are therefore fitted again and selected on a finer grid. The selected family is fitted on both grids. The
+constants of the material follow by extrapolation to a cell size of zero (`FamilyFit.extrapolated`). Those of the coarse
+grid predict best on that grid.
 
 The Coulomb coefficient of the body and all its obstacles may be a constant of every family. Where the images also admit
 that the body sticks, the result is a lower bound of the coefficient.
@@ -29,7 +31,7 @@ Several videos of one material share the constants, have one initial motion each
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from neuma_lib.config.identify import FRICTION_NEEDS, IdentifyConfig
@@ -44,6 +46,8 @@ from neuma_lib.fitting.video_residuals import VideoResiduals
 from neuma_lib.mechanics.combinations import Values
 from neuma_lib.sim.model import MPM
 from neuma_lib.splatting.observation import Observation, joint_frames, several
+
+_CONTENDERS = 3  # families that are compared on the finer grid
 
 
 def identify(
@@ -69,8 +73,8 @@ def identify(
             the views of the settings.
         settings: candidates and hyper-parameters.
         published: specification of the law of the scene's prior, an additional start, or None if unknown.
-        refined: for each video, the body with more particles for a finer grid. Without them, constants of the material
-            are not estimated.
+        refined: for each video, the body with more particles for a finer grid. Without them, families are selected on
+            the grid of the model, and constants of the material are not estimated.
         other_videos: initial motion, body and observation of other videos of the same material.
         progress: called with (finished fits, number of fits, mean squared residual).
         log: receives a line for every family.
@@ -118,12 +122,14 @@ def identify(
             if progress:
                 progress(level * len(families) + done + 1, total, run.loss)
     fits = {run.family.name: run.score() for run in running}
-    for name, fit in fits.items():
-        log(
-            f"{name}: loss {fit.loss:.3e}, held out {fit.held_out:.3e}, {fit.rollouts} rollouts, "
-            + ", ".join(f"{key} {value:.4g}" for key, value in fit.values.items())
-        )
-    selected, ties = _select(list(fits.values()), settings)
+    _log_fits(fits.values(), "", log)
+    compared, fine = fits, {}
+    if refined:
+        fine = _on_finer_grid(running, fits, videos, settings)
+        compared = {name: each.score() for name, each in fine.items()}
+        _log_fits(compared.values(), " on the finer grid", log)
+    selected, ties = _select(list(compared.values()), settings)
+    name = selected.family.name
     run = next(run for run in running if run.family is selected.family)
     starts, first = [run.values], rounds - 1
     # If the first frames misled, restart at the coarsest level.
@@ -142,15 +148,16 @@ def identify(
         sticking, start = Family(run.family.name, run.family.spec), (final.values, final.deviations)
         final = FamilyRun(sticking, videos, counts, settings)
         final.begin(start[:1], rounds - 1, start[1])
-    tied, material = [fits[name] for name in ties], None
+    material = None
     if refined and final.alive:
         final.refine(rounds - 1, closely=True)
-        fine = FamilyRun(final.family, videos, counts, settings, fine=True)
-        fine.begin([final.values], rounds - 1, final.deviations)
-        if fine.alive:
-            fine.refine(rounds - 1, closely=True)
-            material = _final_fit(fine, selected, tied)
-    best = _final_fit(final, selected, tied)
+        whole = FamilyRun(final.family, videos, counts, settings, fine=True)
+        starts = [{key: each[key] for key in final.values} for each in (fine[name].values, final.values)]
+        whole.begin(starts, rounds - 1, final.deviations)
+        if whole.alive:
+            whole.refine(rounds - 1, closely=True)
+            material = _final_fit(whole, selected, [compared[tie] for tie in ties])
+    best = _final_fit(final, fits[name], [fits[tie] for tie in ties])
     best.lowest_friction = lowest
     if material is not None:
         material = material.extrapolated(best, settings.refinement)
@@ -158,7 +165,7 @@ def identify(
     return Identified(
         best,
         ties,
-        fits,
+        {**fits, **compared},
         [video.frames[: video.fitted] for video in videos],
         [video.frames[video.fitted :] for video in videos],
         sum(video.rollouts for video in videos),
@@ -166,6 +173,35 @@ def identify(
         settings,
         material,
     )
+
+
+def _on_finer_grid(
+    running: Sequence[FamilyRun],
+    fits: Mapping[str, FamilyFit],
+    videos: Sequence[VideoResiduals],
+    settings: IdentifyConfig,
+) -> dict[str, FamilyRun]:
+    """Fits to the first frames on the finer grid, by name, of families with a held-out loss of at most ``prune_factor``
+    times the lowest, at most `_CONTENDERS`, that continue those on the grid of the model."""
+    ranked = sorted((run for run in running if run.alive), key=lambda run: fits[run.family.name].score)
+    limit = fits[ranked[0].family.name].score + math.log(settings.prune_factor) if ranked else 0.0
+    fine = {}
+    for run in ranked[:_CONTENDERS]:
+        if fits[run.family.name].score <= limit:
+            fine[run.family.name] = FamilyRun(
+                run.family, videos, [video.fitted for video in videos], settings, fine=True
+            )
+            fine[run.family.name].begin([run.values], len(settings.pyramid) - 1, run.deviations)
+    return fine
+
+
+def _log_fits(fits: Iterable[FamilyFit], where: str, log: Callable[[str], None]) -> None:
+    """A line for every family."""
+    for fit in fits:
+        log(
+            f"{fit.family.name}{where}: loss {fit.loss:.3e}, held out {fit.held_out:.3e}, {fit.rollouts} rollouts, "
+            + ", ".join(f"{key} {value:.4g}" for key, value in fit.values.items())
+        )
 
 
 def _final_fit(run: FamilyRun, selected: FamilyFit, ties: Sequence[FamilyFit]) -> FamilyFit:
