@@ -217,6 +217,38 @@ def test_two_grids_give_the_constants_of_the_material():
     assert "of the material" in written["says"]
 
 
+def test_the_finer_grid_decides_between_families_of_similar_scores(monkeypatch):
+    """Scores are given: on the grid of the model hencky is best, neo_hookean close and fixed_corotated far."""
+    coarse = {"hencky": -8.0, "neo_hookean": -7.5, "stvk": -7.0, "fixed_corotated": -6.0}
+    fine = {"hencky": -8.0, "neo_hookean": -9.0, "stvk": -8.5}
+    compared, scored = [], FamilyRun.score
+
+    def score(run):
+        name, fit = run.family.name, scored(run)
+        if run.counts[0] < len(FRAMES):  # held-out frames remain
+            fit.score = (fine if run._fine else coarse)[name]
+            fit.held_out = math.exp(fit.score)
+            compared.extend([name] if run._fine else [])
+        return fit
+
+    monkeypatch.setattr(FamilyRun, "score", score)
+    body, seen = video_of(ELASTIC, V0, FRAMES)
+    names = {
+        "hencky": ELASTIC,
+        "fixed_corotated": law("fixed_corotated"),
+        "neo_hookean": law("neo_hookean"),
+        "stvk": law("stvk"),
+    }
+    options = settings(names, covariance_from="elastic", pyramid=(4, 8), prune_factor=math.exp(1.2), tie=0.6)
+    result = identify(MODEL, known(body), body, seen, options, refined=[body])
+    assert sorted(compared) == ["hencky", "neo_hookean", "stvk"]
+    assert result.best.family.name == "neo_hookean" and result.ties == ["stvk"]
+    assert result.material.family.name == "neo_hookean"
+    assert result.fits["hencky"].score == fine["hencky"] and result.fits["fixed_corotated"].score == -6.0
+    alone = identify(MODEL, known(body), body, seen, options)
+    assert alone.best.family.name == "hencky" and alone.material is None
+
+
 @pytest.mark.parametrize("refinement", [2, 3])
 def test_an_extrapolation_covers_both_orders_of_convergence(refinement):
     """Errors of log E that are proportional to dx^2 vanish, those that are proportional to dx are one standard

@@ -1,5 +1,6 @@
 """Which parts of a structured law are corrected, and that the others stay unchanged."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -21,6 +22,7 @@ from neuma_lib.fitting.structured_fit import (
     train_structured,
 )
 from neuma_lib.mechanics.structured import structured_law
+from neuma_lib.sim.colliders import Collider
 from neuma_lib.sim.rollout import rollout
 from tests.support.errors import refused
 from tests.support.grounding_scene import MODEL, TRUTH, ball, observe
@@ -308,6 +310,18 @@ def test_a_video_from_a_frame_on_is_the_rest_of_the_whole(first):
     targets = ParticleLoss(frames, path.x.flip(0))
     _, rest = from_frame(start, targets, path, first)
     assert torch.allclose(rest(again), targets(path)[first:], rtol=1e-9)
+
+
+def test_obstacles_move_in_a_fit_as_in_the_video():
+    """A plate rises into the falling ball. The true law then reproduces the frames that inform on the law."""
+    plate = Collider("box", (0.4, 0.02, 0.4), centre=(0.5, -0.1, 0.5), velocity=(0.0, 2.0, 0.0))
+    model = replace(MODEL, colliders=(Collider("plane"), plate))
+    body, frames = ball(), (0, 20, 40, 60, 70, 80, 90, 100)
+    loss = PixelLoss(body, observe(body, V0, frames, model=model))
+    law = structured_law(TRUTH, MODEL.dt).double()
+    law.attach_adaptor(rank=None)
+    _, choice = train_structured(model, law, body.state(V0), loss, SETTINGS, STRUCTURED, log=lambda _: None)
+    assert model.changes and choice.trials["nothing"].held_out_loss < 1e-12
 
 
 def test_frames_after_the_contact_inform_on_the_law_unless_too_few_follow():
