@@ -22,6 +22,7 @@ from neuma_lib.fitting.least_squares import (
     in_blocks,
     jackknife,
     levenberg_marquardt,
+    secant_update,
 )
 from neuma_lib.fitting.video_residuals import MOTION, NUISANCES, Candidate, VideoResiduals, averaged
 from neuma_lib.mechanics.combinations import Values
@@ -61,6 +62,7 @@ class FamilyRun:
         self._u = np.zeros(self._constants + NUISANCES * len(videos))
         self._images: dict[bytes, list[Tensor] | None] = {}
         self._columns: dict[bytes, list[list[Tensor]]] = {}
+        self._exact = True
 
     @cached_property
     def _places(self) -> list[tuple[int, int, int]]:
@@ -130,6 +132,7 @@ class FamilyRun:
             self.settings.min_gain * (_CLOSE_GAIN if closely else _LAST_GAIN if last else 1.0),
             self.settings.iterations,
             longest=self.settings.longest_step,
+            secant=True,
         )
         self.steps += steps
         self.refined = last
@@ -241,13 +244,18 @@ class FamilyRun:
     def _cost(self, residual: Sequence[Tensor]) -> float:
         return _squares(self._at_level(residual))
 
-    def linearise(self, unknowns: np.ndarray, free: Sequence[int]) -> Linearisation:
-        """Sums of the residuals and of their forward differences for the blocks of all videos."""
+    def linearise(self, unknowns: np.ndarray, free: Sequence[int], exact: bool = True) -> Linearisation:
+        """Sums of the residuals and of their derivatives for the blocks of all videos.
+
+        Derivatives by the constants are forward differences, or updated from those before a step.
+        """
         residual = self._residual(unknowns)
         key = unknowns.tobytes()
+        if key not in self._columns or exact and not self._exact:
+            self._exact = exact or not any(before in self._images for before in self._columns)
+            columns = self._constant_columns if self._exact else self._updated_columns
+            self._columns = {key: columns(unknowns, residual)}
         self._images = {key: residual}  # the next level starts here
-        if key not in self._columns:
-            self._columns = {key: self._constant_columns(unknowns, residual)}
         curvatures, scores, k, averages = [], [], len(unknowns), self._at_level(residual)
         for at, r in enumerate(averages):
             columns = self._columns_of(at)
@@ -263,7 +271,7 @@ class FamilyRun:
         first = sum(r.numel() for r, (v, *_) in zip(averages, self._places, strict=True) if v == 0)
         count = len(self.videos) * first
         return Linearisation(
-            np.concatenate(curvatures), np.concatenate(scores), cost, math.sqrt(cost / count)
+            np.concatenate(curvatures), np.concatenate(scores), cost, math.sqrt(cost / count), self._exact
         )
 
     def _columns_of(self, at: int) -> dict[int, Tensor]:
@@ -293,6 +301,19 @@ class FamilyRun:
             if not missing:
                 break
         return columns
+
+    def _updated_columns(self, unknowns: np.ndarray, residual: Sequence[Tensor]) -> list[list[Tensor]]:
+        """Derivatives by the constants after a step from where they were known, which `_images` still has."""
+        ((key, columns),) = self._columns.items()
+        before, step = self._images[key], unknowns - np.frombuffer(key)
+        own = step[: self._constants].tolist()
+        if not any(own):
+            return columns
+        updated = []
+        for at, (new, old) in enumerate(zip(residual, before, strict=True)):
+            predicted = sum(step[i] * column for i, column in self._columns_of(at).items())
+            updated.append(secant_update([column[at] for column in columns], own, new - old - predicted))
+        return [list(column) for column in zip(*updated, strict=True)]
 
     @property
     def _spreads(self) -> np.ndarray:

@@ -30,12 +30,14 @@ class Linearisation:
         scores: J^T r of every block, shape (blocks, k).
         cost: r^T r.
         rms: root mean square of r.
+        exact: whether J has been differentiated here, instead of updated from a former point (`secant_update`).
     """
 
     curvatures: np.ndarray
     scores: np.ndarray
     cost: float
     rms: float
+    exact: bool = True
 
     @property
     def curvature(self) -> np.ndarray:
@@ -59,8 +61,9 @@ class Residuals(Protocol):
     def cost(self, unknowns: np.ndarray) -> float:
         """Sum of squares, infinite if there is no image."""
 
-    def linearise(self, unknowns: np.ndarray, free: Sequence[int]) -> Linearisation:
-        """The problem linearised at unknowns with a finite cost; columns that are not free are 0."""
+    def linearise(self, unknowns: np.ndarray, free: Sequence[int], exact: bool = True) -> Linearisation:
+        """The problem linearised at unknowns with a finite cost; columns that are not free are 0. J need not be exact
+        unless it has to."""
 
 
 def in_blocks(values: Tensor) -> Tensor:
@@ -81,6 +84,7 @@ def levenberg_marquardt(
     iterations: int,
     progress: Callable[[int, int, float], None] | None = None,
     longest: float | None = None,
+    secant: bool = False,
 ) -> tuple[np.ndarray, Linearisation, int]:
     """Minimise |r(u)|^2 + u^T P u over the free unknowns.
 
@@ -93,6 +97,8 @@ def levenberg_marquardt(
         iterations: maximum number of attempted steps.
         progress: called with (step, steps, rms).
         longest: largest change of an unknown in a step, None for no limit.
+        secant: whether J may be updated instead of differentiated after a step. It is differentiated again after a
+            step that fails, and before the result.
 
     Returns:
         The unknowns (k,), the linearisation there in the free ones, and the number of accepted steps.
@@ -107,19 +113,38 @@ def levenberg_marquardt(
         if longest is not None:
             step *= min(1.0, longest / max(np.abs(step).max(), MIN_COST))
         if slope @ np.linalg.solve(A, slope) < min_gain * max(fit.cost, MIN_COST):
-            break
+            if fit.exact:
+                break
+            fit = residuals.linearise(u, free)
+            continue
         trial = u + step
         before, after = fit.cost + u @ P @ u, residuals.cost(trial) + trial @ P @ trial
         if after < before:
             u, damping, accepted = trial, max(damping / 5, _MIN_DAMPING), accepted + 1
-            fit = residuals.linearise(u, free)
-        else:
+            fit = residuals.linearise(u, free, exact=not secant)
+        elif fit.exact:
             damping *= 8
+        else:
+            fit = residuals.linearise(u, free)
         if progress:
             progress(iteration + 1, iterations, fit.rms)
         if damping > _MAX_DAMPING:
             break
+    if not fit.exact:
+        fit = residuals.linearise(u, free)
     return u, fit, accepted
+
+
+def secant_update(columns: Sequence[Tensor], step: Sequence[float], remainder: Tensor) -> list[Tensor]:
+    """Columns of the Jacobian after a step (Broyden 1965): the smallest change that explains the step.
+
+    Args:
+        columns: before the step.
+        step: change of the unknowns of the columns, not all 0.
+        remainder: change of the residuals minus that predicted by all columns, shaped like a column.
+    """
+    size = sum(part**2 for part in step)
+    return [column + part / size * remainder for column, part in zip(columns, step, strict=True)]
 
 
 def jackknife(fit: Linearisation, penalty: np.ndarray) -> np.ndarray:

@@ -318,7 +318,9 @@ class _Residuals:
             unknowns,
         )
 
-    def linearise(self, unknowns: np.ndarray, free: Sequence[int] = _ALL) -> Linearisation:
+    def linearise(
+        self, unknowns: np.ndarray, free: Sequence[int] = _ALL, exact: bool = True
+    ) -> Linearisation:
         """Sums of the residuals and of their central differences, 0 for unknowns that are not free."""
         cost, count, sums = 0.0, 0, []
         for video in range(len(self.videos)):

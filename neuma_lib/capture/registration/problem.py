@@ -95,7 +95,7 @@ class Problem:
         """Sum of squares."""
         return float(costs(self.pictures, self.pose(unknowns), self.time).sum())
 
-    def linearise(self, unknowns: np.ndarray, free: Sequence[int]) -> Linearisation:
+    def linearise(self, unknowns: np.ndarray, free: Sequence[int], exact: bool = True) -> Linearisation:
         """The problem linearised at unknowns; columns that are not free are 0."""
         pictures, pose = self.pictures, self.pose(unknowns)
         times = picture_times(pictures, pose, self.time)
