@@ -182,16 +182,20 @@ def _on_finer_grid(
     settings: IdentifyConfig,
 ) -> dict[str, FamilyRun]:
     """Fits to the first frames on the finer grid, by name, of families with a held-out loss of at most ``prune_factor``
-    times the lowest, at most `_CONTENDERS`, that continue those on the grid of the model."""
+    times the lowest, at most `_CONTENDERS`, that continue those on the grid of the model.
+
+    Images of the finer grid may differ by more than a pixel, hence the fit at the coarsest level first.
+    """
     ranked = sorted((run for run in running if run.alive), key=lambda run: fits[run.family.name].score)
     limit = fits[ranked[0].family.name].score + math.log(settings.prune_factor) if ranked else 0.0
     fine = {}
     for run in ranked[:_CONTENDERS]:
         if fits[run.family.name].score <= limit:
-            fine[run.family.name] = FamilyRun(
-                run.family, videos, [video.fitted for video in videos], settings, fine=True
-            )
-            fine[run.family.name].begin([run.values], len(settings.pyramid) - 1, run.deviations)
+            again = FamilyRun(run.family, videos, [video.fitted for video in videos], settings, fine=True)
+            again.begin([run.values], 0, run.deviations)
+            if again.alive:
+                again.refine(len(settings.pyramid) - 1)
+            fine[run.family.name] = again
     return fine
 
 
