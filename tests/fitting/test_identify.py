@@ -239,7 +239,7 @@ def test_the_finer_grid_decides_between_families_of_similar_scores(monkeypatch):
         "neo_hookean": law("neo_hookean"),
         "stvk": law("stvk"),
     }
-    options = settings(names, covariance_from="elastic", pyramid=(4, 8), prune_factor=math.exp(1.2), tie=0.6)
+    options = settings(names, covariance_from="elastic", pyramid=(4, 8), prune_factor=math.exp(1.9), tie=0.6)
     result = identify(MODEL, known(body), body, seen, options, refined=[body])
     assert sorted(compared) == ["hencky", "neo_hookean", "stvk"]
     assert result.best.family.name == "neo_hookean" and result.ties == ["stvk"]
