@@ -175,7 +175,10 @@ def fly_and_simulate(
     if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
         cache_bytes = DEFAULT_CACHE_BYTES[x.device.type] if cache_bytes is None else cache_bytes
         nodes, contact = copies * model.nodes**3, model.contact == "particles"
-        plan = plan_memory(steps, len(x), nodes, x.element_size(), cache_bytes, memory, total, contact)
+        keeps_grids = x.device.type != "cpu"
+        plan = plan_memory(
+            steps, len(x), nodes, x.element_size(), cache_bytes, memory, total, contact, keeps_grids
+        )
     simulation = Simulation(
         model, regions, slices, state, steps, first, plan, scatter, total, copies, frictions
     )

@@ -211,8 +211,9 @@ class Simulation:
         F, F_trial = ws.F[ws.at(n)], ws.F_trial[cached]
         if not self.plan.caches_steps:
             self._evaluate("elasticity", n, F, weights, ws.tau[cached], fill_cache=True)
-            ws.transfer_to_grid(n)
             ws.trial_deformation(n)
+        if not self.plan.caches_steps or ws.on_cpu:
+            ws.transfer_to_grid(n)
         self._vjp("plasticity", n, F_trial, weights, ws.grad_F, ws.grad_F_trial, sums)
         ws.transfer_adjoint(n)
         self._vjp("elasticity", n, F, weights, ws.grad_tau, ws.grad_F_elastic, sums)
@@ -255,7 +256,8 @@ class Simulation:
         ws = self.workspace
         totals = ws.grad_states
         frame_of = {n: index for index, n in enumerate(at)}
-        ws.grad_grid.zero_()
+        if not ws.on_cpu:
+            ws.grad_grid.zero_()
         with ws.stream():
             sums = {
                 part: [

@@ -23,14 +23,19 @@ from neuma_lib.sim.clamp_kernels import hold_type, holds
 from neuma_lib.sim.colliders import contact_radius
 from neuma_lib.sim.contact_kernels import STICKING, distances, obstacle_type, obstacles
 from neuma_lib.sim.graphs import MAX_GRAPHS, GraphCache
-from neuma_lib.sim.kernels import NO_FAULT, forward_kernels, warp_types
+from neuma_lib.sim.kernels import NO_FAULT, deformation_kernels, forward_kernels, warp_types
 from neuma_lib.sim.model import MPM, WALLS
+from neuma_lib.sim.sequence import Index, LaunchSequence, Repeated
+from neuma_lib.sim.transfers import transfer_kernels
 
 SORT_EVERY = 16
 """Steps between sorts of the particles by cell, for scatter methods that need it."""
 
 BLOCK = 64
 """Threads per block on a GPU. Small blocks distribute better, since 30,000 particles are few for a GPU."""
+
+_PADDING = 1
+"""Nodes beyond the end of a grid, which loops on a CPU read and write with the three before them."""
 
 LEAVING = 1e-3
 """Tolerance for round-off beyond the last position with a stencil [dx], where the weights still sum to 1."""
@@ -110,7 +115,15 @@ class Workspace:
         if self._contact:
             self.states += (self.stuck,)
         self.tau, self.F_trial = self._buffer((cached, N), "mat33"), self._buffer((cached, N), "mat33")
-        self.grid, self.grid_v = self._buffer((cached, nodes), "vec4"), self._buffer((cached, nodes), "vec4")
+        if self.on_cpu:
+            self.grids = self._buffer((2 + size.differentiable, nodes + _PADDING), "vec4")
+            self.grid, self.grid_v, *_ = self.grids[:, None, :nodes]
+            self.spans = self._buffer((size.copies * 4 * size.model.nodes**2,), dtype=torch.int32)
+        else:
+            self.grid, self.grid_v = (
+                self._buffer((cached, nodes), "vec4"),
+                self._buffer((cached, nodes), "vec4"),
+            )
         self.mass, self.vol0, self.radius = (self._buffer((N,), "real") for _ in range(3))
         self.frictions = np.zeros((size.copies, len(size.model.obstacles)))
         self.obstacles = self._obstacles([0.0] * size.n_poses)
@@ -132,7 +145,11 @@ class Workspace:
         self.order = self._buffer((n_sorts, N if self.sorts else 1), dtype=torch.int32)
         self.cells = self._buffer((N if self.sorts else 1,), dtype=torch.int32)
         self._constants = _grid_constants(size)
-        self._record_forward()
+        self._deformation = deformation_kernels(size.dtype)
+        if self.on_cpu:
+            self._record_forward_on_cpu()
+        else:
+            self._record_forward()
         if size.differentiable:
             self.grad_x, self.grad_v = self._buffer((N,), "vec3"), self._buffer((N,), "vec3")
             self.grad_C, self.grad_F = self._buffer((N,), "mat33"), self._buffer((N,), "mat33")
@@ -145,8 +162,11 @@ class Workspace:
             self.grad_stuck = self._buffer((N if self._contact else 1,), "vec3")
             if self._contact:
                 self.grad_states += (self.grad_stuck,)
-            self.grad_grid = self._buffer((2, nodes), "vec4")
-            self._record_adjoint()
+            if self.on_cpu:
+                self._record_adjoint_on_cpu()
+            else:
+                self.grad_grid = self._buffer((2, nodes), "vec4")
+                self._record_adjoint()
 
     def at(self, step: int) -> int:
         """Index of the state before a step."""
@@ -244,6 +264,9 @@ class Workspace:
 
     def transfer_to_grid(self, step: int) -> None:
         """From tau and the state of a step to the velocities of the nodes."""
+        if self.on_cpu:
+            self._to_grid.run(step)
+            return
         cached = self.cached_at(step)
         self.grid[cached].zero_()
         if self.size.model.clamps:
@@ -254,6 +277,9 @@ class Workspace:
 
     def transfer_to_particles(self, step: int) -> None:
         """From velocities of the nodes to x, v, C and the total deformation after the step, and to F_trial."""
+        if self.on_cpu:
+            self._to_particles.run(step)
+            return
         now, after = self.at(step), self.at(step + 1)
         _run(self._g2p, now, after, self.cached_at(step), step, self.pose_at(step))
         if self.size.total:
@@ -261,17 +287,21 @@ class Workspace:
 
     def trial_deformation(self, step: int) -> None:
         """Recompute F_trial of a step from the F before and the C after it."""
+        if self.on_cpu:
+            self._to_trial.run(step)
+            return
         _run(self._trial, self.at(step), self.at(step + 1), self.cached_at(step))
 
     def tracer_launch(self, tracers: Tensor) -> wp.Launch:
         """A recorded launch, for `move_tracers`, that advects `tracers` (M, 3) in place."""
-        kernel = forward_kernels(self.size.dtype, self.size.scatter, self._features).advect_tracers
         positions = wp.from_torch(tracers, dtype=warp_types(self.size.dtype).vec3)
-        return self._record(kernel, len(tracers), 0, self._rows(self.grid_v), positions)
+        return self._record(
+            self._deformation.advect_tracers, len(tracers), 0, self._rows(self.grid_v), positions
+        )
 
     def move_tracers(self, launch: wp.Launch, step: int) -> None:
         """Advect tracers by the node velocities of a step."""
-        _run(launch, self.cached_at(step))
+        _run(launch, 0 if self.on_cpu else self.cached_at(step))
 
     def transfer_adjoint(self, step: int) -> None:
         """From gradients of the state after a step and of F_trial to those of the state before it and of tau.
@@ -279,6 +309,9 @@ class Workspace:
         grad_x, grad_v, grad_C and grad_F_total are updated in place, and grad_F is set to the contribution of F_trial.
         Call it for decreasing steps after clearing `grad_grid` once.
         """
+        if self.on_cpu:
+            self._reverse.run(step)
+            return
         now, after, cached = self.at(step), self.at(step + 1), self.cached_at(step)
         side = step % 2
         if self.size.total:
@@ -323,6 +356,25 @@ class Workspace:
             **options,
         )
 
+    def _repeated(self, kernel: wp.Kernel, dim: int, *args: Tensor | wp.array, **indices: Index) -> Repeated:
+        """A launch for `LaunchSequence`. The kernel's integer arguments after the constants are indices by name."""
+        size = self.size
+        known = {
+            "now": Index(modulus=size.n_states),
+            "after": Index(1, size.n_states),
+            "cached": Index(modulus=size.n_cached_steps),
+            "pose": Index(modulus=size.n_poses),
+            "step": Index(),
+            **indices,
+        }
+        labels = [arg.label for arg in kernel.adj.args]
+        numbers = {position: known[label] for position, label in enumerate(labels) if label in known}
+        return Repeated(self._record(kernel, dim, *(0 for _ in numbers), *args), numbers)
+
+    @property
+    def on_cpu(self) -> bool:
+        return self.size.device.type == "cpu"
+
     @property
     def _contact(self) -> bool:
         """Whether particles touch colliders."""
@@ -332,9 +384,13 @@ class Workspace:
     def _features(self) -> tuple[str, ...]:
         """Features of the model for the kernels."""
         meshes = any(collider.distances for collider in self.size.model.colliders)
-        return (
-            ("contact",) * self._contact + ("meshes",) * meshes + ("clamps",) * bool(self.size.model.clamps)
-        )
+        has = {
+            "contact": self._contact,
+            "meshes": meshes,
+            "clamps": bool(self.size.model.clamps),
+            "walls": self.on_cpu and self.size.model.wall_nodes > 0,
+        }
+        return tuple(name for name, value in has.items() if value)
 
     @property
     def _node_count(self) -> int:
@@ -346,6 +402,83 @@ class Workspace:
         """Threads of a scattering kernel, a multiple of `BLOCK` if the threads of a warp cooperate."""
         N = self.size.particles
         return -(-N // BLOCK) * BLOCK if self.sorts else N
+
+    def _record_forward_on_cpu(self) -> None:
+        k = transfer_kernels(self.size.dtype, self._features)
+        N, clamps = self.size.particles, bool(self.size.model.clamps)
+        held = self.holds, self.clamp
+        mass, vol0, radius = self.mass, self.vol0, self.radius
+        if clamps:
+            mass, vol0, radius = (self._buffer((N,), "real") for _ in range(3))
+        self._now = mass, vol0, radius
+        self._v_now = self._buffer((N if self._contact else 1,), "vec3")
+        self._touches = self._buffer((N if self._contact else 1,), dtype=torch.int32)
+        to_grid, to_particles = [], []
+        if clamps:
+            to_grid.append(self._repeated(
+                k.hold, N, self.x, self.mass, self.vol0, self.radius, *held, mass, vol0, radius,
+                self.held_mass, self.held_by,
+            ))  # fmt: skip
+        if self._contact:
+            to_grid.append(self._repeated(
+                k.touch, N, self.x, self.v, radius, self.obstacles, self.distances, self.stuck,
+                self._v_now, self._touches,
+            ))  # fmt: skip
+        to_grid += [
+            self._repeated(
+                k.p2g, 1, self.x, self.v, self.C, self.tau, mass, vol0, self._v_now, self.spans, self.grids
+            ),
+            self._repeated(
+                k.grid_update, 1, self.spans, self.grids, self.holds, self.held_mass, self.held_by
+            ),
+        ]
+        to_particles.append(self._repeated(
+            k.g2p, 1, self.grids, mass, self.x, self.v, self.C, self.F, self.F_trial, self.faults
+        ))  # fmt: skip
+        if clamps:
+            to_particles.append(self._repeated(
+                k.move_held, N, self.x, self.v, self.C, self.F, self.F_trial, *held, self.faults
+            ))  # fmt: skip
+        if self.size.total:
+            after = Index(1, self.size.n_states)
+            to_particles.append(
+                self._repeated(k.trial_deformation, 1, self.C, self.F_total, self.F_total, cached=after)
+            )
+        self._to_grid, self._to_particles = LaunchSequence(to_grid), LaunchSequence(to_particles)
+        self._to_trial = LaunchSequence(
+            [self._repeated(k.trial_deformation, 1, self.C, self.F, self.F_trial)]
+        )
+
+    def _record_adjoint_on_cpu(self) -> None:
+        k, N = transfer_kernels(self.size.dtype, self._features), self.size.particles
+        mass, vol0, radius = self._now
+        launches = []
+        if self.size.total:
+            launches.append(self._repeated(
+                self._deformation.total_adjoint, N, self.C, self.F_total, self.grad_C, self.grad_F_total
+            ))  # fmt: skip
+        launches.append(self._repeated(
+            k.g2p_adjoint, 1, self.grids, mass, self.x, self.v, self.C, self.F,
+            self.grad_v, self.grad_C, self.grad_F_trial, self.grad_x, self.grad_F,
+        ))  # fmt: skip
+        if self.size.model.clamps:
+            launches.append(self._repeated(
+                k.held_adjoint, N, self.x, self.C, self.grad_v, self.grad_F_trial, self.grad_x, self.grad_F,
+                self.holds, self.clamp,
+            ))  # fmt: skip
+        launches += [
+            self._repeated(k.grid_adjoint, 1, self.spans, self.grids),
+            self._repeated(
+                k.p2g_adjoint, 1, self.x, self.v, self.C, self.tau, mass, vol0, self._v_now, self.grids,
+                self.grad_x, self.grad_v, self.grad_C, self.grad_tau,
+            ),
+        ]  # fmt: skip
+        if self._contact:
+            launches.append(self._repeated(
+                k.touch_adjoint, N, self.x, self.v, radius, self.obstacles, self.distances, self.stuck,
+                self._touches, self.grad_x, self.grad_v, self.grad_stuck,
+            ))  # fmt: skip
+        self._reverse = LaunchSequence(launches)
 
     def _record_forward(self) -> None:
         k = forward_kernels(self.size.dtype, self.size.scatter, self._features)
@@ -366,10 +499,14 @@ class Workspace:
             k.g2p, N, 0, 0, 0, 0, 0,
             rows_v, self.x, self.v, self.C, self.F, self.F_trial, *held, self.faults,
         )  # fmt: skip
-        self._trial = self._record(k.trial_deformation, N, 0, 0, 0, self.C, self.F, self.F_trial)
+        self._trial = self._record(
+            self._deformation.trial_deformation, N, 0, 0, 0, self.C, self.F, self.F_trial
+        )
         if self.size.total:
             F_total = self.F_total
-            self._total = self._record(k.trial_deformation, N, 0, 0, 0, self.C, F_total, F_total)
+            self._total = self._record(
+                self._deformation.trial_deformation, N, 0, 0, 0, self.C, F_total, F_total
+            )
 
     def _record_adjoint(self) -> None:
         k = adjoint_kernels(self.size.dtype, self.size.scatter, self._features)
@@ -390,7 +527,7 @@ class Workspace:
         )  # fmt: skip
         if self.size.total:
             self._total_adjoint = self._record(
-                k.total_adjoint, N, 0, 0, self.C, self.F_total, self.grad_C, self.grad_F_total
+                self._deformation.total_adjoint, N, 0, 0, self.C, self.F_total, self.grad_C, self.grad_F_total
             )
 
 
