@@ -14,6 +14,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
+from neuma_lib.mechanics import analytic_kernels as kernels
 from neuma_lib.mechanics.catalogue import Constant, check_constants
 from neuma_lib.mechanics.singular_values import away_from_zero, rotation_and_singular_values, svd3
 
@@ -144,13 +145,17 @@ def isotropic_deformation(F: Tensor, function: PrincipalFunction) -> Tensor:
 
 
 class Constants(nn.Module):
-    """Mix-in that checks and holds the constants of a law.
+    """Mix-in of an `Elasticity` or `Plasticity` that checks and holds the constants of a law.
 
     A number is fixed. A tensor that requires a gradient becomes one of the law's ``weights()``, in the order of
     ``constants``, so that an analytic law can be fitted like a neural one.
+
+    The built-in laws state their ``coefficients``, a static function of the constants as tensors, and are evaluated by
+    :mod:`analytic_kernels`. Other laws, which may derive from these, are evaluated by `response`.
     """
 
     constants: dict[str, Constant] = {}
+    part: str
 
     def __init__(self, **values: float | Tensor):
         super().__init__()
@@ -170,3 +175,69 @@ class Constants(nn.Module):
     def with_weights(self, weights: tuple[Tensor, ...]) -> dict[str, float | Tensor]:
         """All constants, with the given weights in place of the fitted ones."""
         return {**self.values, **dict(zip(self._fitted(), weights, strict=True))}
+
+    @property
+    def native(self) -> bool:
+        """Whether the law has a kernel."""
+        return "coefficients" in vars(type(self))
+
+    @property
+    def capturable(self) -> bool:
+        """Whether `evaluate` and `vjp` can be recorded in a CUDA graph. The constants are then part of it."""
+        return self.native and not self._fitted()
+
+    def row(self, weights: tuple[Tensor, ...] = ()) -> Tensor:
+        """Row of the kernels (1 + COEFFICIENTS,) in float64, differentiable in the constants. ``weights`` replace the
+        fitted ones if given."""
+        values = self.with_weights(weights) if weights else self.values
+        device = next((w.device for w in weights), None)
+        tensors = {key: torch.as_tensor(x, dtype=torch.float64, device=device) for key, x in values.items()}
+        return kernels.row(type(self).__name__, self.coefficients(**tensors))
+
+    def _rows(self, F: Tensor, weights: tuple[Tensor, ...]) -> Tensor:
+        """Rows (1, 1 + COEFFICIENTS) for F, kept while the weights do not change."""
+        used = tuple((w, w._version) for w in weights)
+        key, rows = self.__dict__.get("_kept", (None, None))
+        state = len(weights), F.dtype, F.device
+        if key is None or key[0] != state or any(a is not b or n != m for (a, n), (b, m) in zip(key[1], used, strict=True)):
+            with torch.no_grad():
+                rows = self.row(weights)[None].to(F.device, F.dtype)
+            self.__dict__["_kept"] = (state, used), rows
+        return rows
+
+    def evaluate(self, F: Tensor, weights: tuple[Tensor, ...], out: Tensor | None = None) -> Tensor:
+        if not self.native:
+            return super().evaluate(F, weights, out)
+        return kernels.evaluate(self.part, F, self._rows(F, weights), out)
+
+    def vjp(self, F, weights, grad_out, cache=None, grad_F=None, grad_weights=None):
+        if not self.native:
+            return super().vjp(F, weights, grad_out, cache, grad_F, grad_weights)
+        if grad_weights is None:
+            grad_weights = tuple(torch.zeros_like(w) for w in weights)
+        sums = grad_weights if _are_rows(grad_weights) else self.accumulators(F, grad_weights)
+        result = kernels.vjp(
+            self.part, F, self._rows(F, weights), grad_out, grad_F, sums[0] if weights else None
+        )
+        if sums is not grad_weights:
+            self.add_up(sums, weights, grad_weights)
+        return result, grad_weights
+
+    def accumulators(self, F, grad_weights):
+        if not self.native or not grad_weights:
+            return grad_weights
+        return (torch.zeros(1, 1 + kernels.COEFFICIENTS, dtype=torch.float64, device=F.device),)
+
+    def add_up(self, accumulators, weights, grad_weights):
+        if not _are_rows(accumulators):
+            return
+        with torch.enable_grad():
+            leaves = [w.detach().requires_grad_() for w in weights]
+            row = self.row(tuple(leaves))
+        for total, grad in zip(grad_weights, torch.autograd.grad(row, leaves, accumulators[0][0]), strict=True):
+            total.add_(grad)
+
+
+def _are_rows(accumulators: tuple[Tensor, ...]) -> bool:
+    """Whether these are gradients of rows instead of constants."""
+    return len(accumulators) == 1 and accumulators[0].ndim == 2

@@ -35,6 +35,8 @@ class Constitutive(nn.Module):
     capturable = False
     """Whether `evaluate` and `vjp` can be recorded in a CUDA graph: they read nothing from the device and reuse all
     scratch memory."""
+    native = False
+    """Whether `evaluate` and `vjp` are kernels, with `response` as their reference, instead of torch."""
     adjoint_precision: AdjointPrecision = "single"
     """Precision of the matrix products in `vjp`. "half" uses factors of 11 bits and sums them in float32, for laws
     with such kernels."""
@@ -130,8 +132,8 @@ class Constitutive(nn.Module):
         """
         return grad_weights
 
-    def add_up(self, accumulators: Weights, grad_weights: Weights) -> None:
-        """Add the contents of the buffers of :meth:`accumulators` to ``grad_weights``."""
+    def add_up(self, accumulators: Weights, weights: Weights, grad_weights: Weights) -> None:
+        """Add the contents of the buffers of :meth:`accumulators` to ``grad_weights``, the gradients of ``weights``."""
 
 
 class Elasticity(Constitutive):

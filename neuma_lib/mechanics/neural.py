@@ -92,6 +92,7 @@ class NeuralConstitutive(AdaptableConstitutive):
     kind: str
     scale: float
     capturable = True
+    native = True
     fused: bool | None = None
     """Whether evaluate and vjp use :mod:`neural_fused`: False never, True always, None where it is supported."""
 
@@ -147,7 +148,7 @@ class NeuralConstitutive(AdaptableConstitutive):
 
     def _network(self, F: Tensor, weights: Weights, state: _Forward) -> None:
         """Fill ``state`` from the rows F."""
-        launch(feature_kernel(F.dtype), pack_count(len(F), F.device), F, state.z, state.R, state.Vh, len(F))
+        launch(feature_kernel(F.dtype), pack_count(len(F), F.device, F.dtype), F, state.z, state.R, state.Vh, len(F))
         W0, W1, W2 = weights
         torch.mm(state.z, W0.mT, out=state.a0)
         aten.gelu.out(state.a0, out=state.h0)
@@ -159,7 +160,7 @@ class NeuralConstitutive(AdaptableConstitutive):
         return (neural_fused.partial_sums(F),) if self.uses_fused(F) else grad_weights
 
     @torch.no_grad()
-    def add_up(self, accumulators, grad_weights):
+    def add_up(self, accumulators, weights, grad_weights):
         if len(accumulators) != len(grad_weights):
             neural_fused.add_up(*accumulators, grad_weights)
 

@@ -23,7 +23,7 @@ def svd3(F: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     F = F.detach().contiguous()
     U, sigma, Vh = torch.empty_like(F), F.new_empty(F.shape[:-1]), torch.empty_like(F)
     if len(F):
-        launch(svd_kernel(F.dtype), pack_count(len(F), F.device), F, U, sigma, Vh, len(F))
+        launch(svd_kernel(F.dtype), pack_count(len(F), F.device, F.dtype), F, U, sigma, Vh, len(F))
     return U, sigma, Vh
 
 

@@ -274,7 +274,7 @@ class Simulation:
                 self.step_adjoint(n - 1, weights, sums)
             for part in PARTS:
                 for (law, _, own, _), received in zip(self._laws(part, 0), sums[part], strict=True):
-                    law.add_up(received, tuple(grad_weights[own]))
+                    law.add_up(received, tuple(weights[own]), tuple(grad_weights[own]))
 
     def _copy_frames(
         self, first: int, steps: Sequence[int], frames: Sequence[int], result: Sequence[Tensor]

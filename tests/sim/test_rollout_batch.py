@@ -8,7 +8,7 @@ import torch
 
 from neuma_lib.errors import NonFiniteError
 from neuma_lib.mechanics.analytic import analytic_law
-from neuma_lib.mechanics.analytic_fused import fusible, side_by_side
+from neuma_lib.mechanics.side_by_side import fusible, side_by_side
 from neuma_lib.sim.batch import rollout_batch
 from neuma_lib.sim.colliders import Collider
 from neuma_lib.sim.memory import MemoryPlan

@@ -7,7 +7,7 @@ from typing import get_args
 import torch
 
 from neuma_lib.mechanics.analytic import analytic_law
-from neuma_lib.mechanics.analytic_fused import side_by_side
+from neuma_lib.mechanics.side_by_side import side_by_side
 from neuma_lib.mechanics.law import AdjointPrecision, Law
 from neuma_lib.mechanics.neural import neural_law
 from neuma_lib.mechanics.structured import FORMS, structured_law

@@ -1,0 +1,171 @@
+"""Kernels of the built-in analytic laws, one forward and one backward for CPU and CUDA, float32 and float64.
+
+``analytic_kernels.h`` states each law once, for packs: one row per SIMD lane on a CPU, one per thread on a GPU. The
+adjoints are closed forms in principal axes. All laws of a kind share a kernel. The law and its constants are a row of
+numbers, so that simulations of several laws can share a launch, and a recorded CUDA graph applies to any constants.
+"""
+
+from functools import cache
+from typing import Literal
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from neuma_lib.device import native_source, start_warp
+from neuma_lib.mechanics.fused_launch import contiguous, launch_blocks
+from neuma_lib.mechanics.singular_values_kernels import (
+    END,
+    FUSE,
+    MATH,
+    ROUND_ALL,
+    SVD,
+    TYPES,
+    filled,
+    pack_count,
+    warp_types,
+)
+
+start_warp()
+
+Kind = Literal["elasticity", "plasticity"]
+
+STRETCH_MIN = 0.05
+"""Logarithms are of max(sigma, STRETCH_MIN), as in NCLaw, which bounds the stress of a crushed element."""
+FIBRE_EXPONENT_MAX = 8.0
+"""Bound on the exponent of the fibre term, which limits its stiffness to e^8 = 3,000 times that at rest."""
+
+LAWS = (
+    "FixedCorotated",
+    "StVK",
+    "Hencky",
+    "NeoHookean",
+    "Fluid",
+    "Tait",
+    "Ogden",
+    "MooneyRivlin",
+    "FibreReinforced",
+    "Identity",
+    "VonMises",
+    "DruckerPrager",
+    "FluidProjection",
+    "ViscousFlow",
+    "CrushableFoam",
+    "HerschelBulkley",
+    "CohesiveDruckerPrager",
+)
+"""Names of the classes of laws with kernels, in the order of their indices."""
+COEFFICIENTS = 7
+"""Largest number of coefficients of a law."""
+THREADS = 64
+"""Threads per block on a GPU."""
+
+
+def row(law: str, coefficients: tuple[Tensor | float, ...]) -> Tensor:
+    """Row (1 + COEFFICIENTS,) of a law in float64: its index in `LAWS` and its coefficients, padded with zeros."""
+    like = next((x for x in coefficients if isinstance(x, Tensor)), torch.zeros(()))
+    numbers = [LAWS.index(law), *coefficients, *(0.0 for _ in range(COEFFICIENTS - len(coefficients)))]
+    return torch.stack([torch.as_tensor(x, dtype=torch.float64, device=like.device) for x in numbers])
+
+
+def laws(dtype: torch.dtype) -> str:
+    """C++ source that defines `stress`, `return_map` and their adjoints, see ``analytic_kernels.h``."""
+    parts = native_source(__file__, ".h")
+    constants = f"    enum {{ {', '.join(LAWS)} }};\n    const int COEFFICIENTS = {COEFFICIENTS};\n"
+    for name, value in (("STRETCH_MIN", STRETCH_MIN), ("FIBRE_EXPONENT_MAX", FIBRE_EXPONENT_MAX)):
+        constants += f"    const Real {name} = Real({value!r});\n"
+    text = FUSE + TYPES + constants + MATH + parts["functions"] + parts["elasticity"] + parts["plasticity"]
+    return filled(text.replace("{ROUND_ALL}", ROUND_ALL).replace("{SVD}", SVD), dtype)
+
+
+def source(kind: Kind, backward: bool, dtype: torch.dtype) -> str:
+    """C++ source of the body of a kernel."""
+    parts = native_source(__file__, ".h")
+    text = parts["rows"] + parts["vjp" if backward else "evaluate"] + END
+    forward, vjp = ("stress", "stress_vjp") if kind == "elasticity" else ("return_map", "return_vjp")
+    return laws(dtype) + text.replace("FORWARD", forward).replace("VJP", vjp)
+
+
+@cache
+def evaluate_kernel(kind: Kind, dtype: torch.dtype):
+    """Kernel (F (copies n, 3, 3), rows, copies, n, out), launched by `launch_blocks`."""
+
+    @wp.func_native(source(kind, False, dtype))
+    def evaluate_rows(F: wp.uint64, rows: wp.uint64, copies: int, n: int, out: wp.uint64): ...
+
+    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
+    def analytic_evaluate(F: wp.uint64, rows: wp.uint64, copies: int, n: int, out: wp.uint64):
+        evaluate_rows(F, rows, copies, n, out)
+
+    return analytic_evaluate
+
+
+@cache
+def vjp_kernel(kind: Kind, dtype: torch.dtype):
+    """Kernel (F (copies n, 3, 3), rows, copies, n, grad_out, grad_F, partials), launched by `launch_blocks`.
+
+    It writes sums of the gradients of the coefficients over packs to partials (packs, COEFFICIENTS) if these are given.
+    """
+
+    @wp.func_native(source(kind, True, dtype))
+    def vjp_rows(
+        F: wp.uint64, rows: wp.uint64, copies: int, n: int, grad_out: wp.uint64, grad_F: wp.uint64, partials: wp.uint64
+    ): ...  # fmt: skip
+
+    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
+    def analytic_vjp(
+        F: wp.uint64, rows: wp.uint64, copies: int, n: int, grad_out: wp.uint64, grad_F: wp.uint64, partials: wp.uint64
+    ):  # fmt: skip
+        vjp_rows(F, rows, copies, n, grad_out, grad_F, partials)
+
+    return analytic_vjp
+
+
+def _blocks(F: Tensor) -> int:
+    """Thread blocks for the rows of F. On a CPU one thread processes all rows."""
+    return 1 if F.device.type == "cpu" else -(-len(F) // THREADS)
+
+
+@torch.no_grad()
+def evaluate(kind: Kind, F: Tensor, rows: Tensor, out: Tensor | None = None) -> Tensor:
+    """Stress or return map of F (copies n, 3, 3), of which each n rows follow one of rows (copies, 1 + COEFFICIENTS).
+
+    ``rows`` has the dtype and device of F.
+    """
+    F = F.detach().contiguous()
+    out = torch.empty_like(F) if out is None else out
+    with contiguous(out) as (result,):
+        if len(F):
+            inputs = F, rows.detach().contiguous(), len(rows), len(F) // len(rows), result
+            launch_blocks(evaluate_kernel(kind, F.dtype), _blocks(F), THREADS, *inputs)
+    return out
+
+
+@torch.no_grad()
+def vjp(
+    kind: Kind,
+    F: Tensor,
+    rows: Tensor,
+    grad_out: Tensor,
+    grad_F: Tensor | None = None,
+    grad_rows: Tensor | None = None,
+) -> Tensor:
+    """Gradient of F. The gradient of ``rows`` is added to ``grad_rows`` (copies, 1 + COEFFICIENTS) if given.
+
+    Its sums over particles are in float64 and do not depend on the number of threads.
+    """
+    F, grad_out = F.detach().contiguous(), grad_out.contiguous()
+    grad_F = torch.empty_like(F) if grad_F is None else grad_F
+    with contiguous(grad_F) as (result,):
+        if len(F):
+            copies, n = len(rows), len(F) // len(rows)
+            partials = None
+            if grad_rows is not None:
+                shape = copies, pack_count(n, F.device, F.dtype), COEFFICIENTS
+                partials = torch.empty(shape, dtype=torch.float64, device=F.device)
+            address = 0 if partials is None else partials.data_ptr()
+            inputs = F, rows.detach().contiguous(), copies, n, grad_out, result, address
+            launch_blocks(vjp_kernel(kind, F.dtype), _blocks(F), THREADS, *inputs)
+            if partials is not None:
+                grad_rows[:, 1:] += partials.sum(1)
+    return grad_F
