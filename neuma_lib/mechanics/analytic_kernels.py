@@ -121,6 +121,11 @@ def vjp_kernel(kind: Kind, dtype: torch.dtype):
     return analytic_vjp
 
 
+def partial_shape(rows: Tensor, n: int, F: Tensor) -> tuple[int, int, int]:
+    """Shape of the partials of a vjp for n rows like F."""
+    return len(rows), pack_count(n // len(rows), F.device, F.dtype), COEFFICIENTS
+
+
 def _blocks(F: Tensor) -> int:
     """Thread blocks for the rows of F. On a CPU one thread processes all rows."""
     return 1 if F.device.type == "cpu" else -(-len(F) // THREADS)

@@ -194,12 +194,23 @@ class Constants(nn.Module):
         tensors = {key: torch.as_tensor(x, dtype=torch.float64, device=device) for key, x in values.items()}
         return kernels.row(type(self).__name__, self.coefficients(**tensors))
 
+    @property
+    def native_rows(self) -> bool:
+        return self.native
+
+    def kernel_rows(self, F: Tensor, weights: tuple[Tensor, ...]) -> Tensor:
+        return self._rows(F, weights)
+
     def _rows(self, F: Tensor, weights: tuple[Tensor, ...]) -> Tensor:
         """Rows (1, 1 + COEFFICIENTS) for F, kept while the weights do not change."""
         used = tuple((w, w._version) for w in weights)
         key, rows = self.__dict__.get("_kept", (None, None))
         state = len(weights), F.dtype, F.device
-        if key is None or key[0] != state or any(a is not b or n != m for (a, n), (b, m) in zip(key[1], used, strict=True)):
+        if (
+            key is None
+            or key[0] != state
+            or any(a is not b or n != m for (a, n), (b, m) in zip(key[1], used, strict=True))
+        ):
             with torch.no_grad():
                 rows = self.row(weights)[None].to(F.device, F.dtype)
             self.__dict__["_kept"] = (state, used), rows
@@ -234,7 +245,9 @@ class Constants(nn.Module):
         with torch.enable_grad():
             leaves = [w.detach().requires_grad_() for w in weights]
             row = self.row(tuple(leaves))
-        for total, grad in zip(grad_weights, torch.autograd.grad(row, leaves, accumulators[0][0]), strict=True):
+        for total, grad in zip(
+            grad_weights, torch.autograd.grad(row, leaves, accumulators[0][0]), strict=True
+        ):
             total.add_(grad)
 
 

@@ -37,6 +37,10 @@ class Constitutive(nn.Module):
     scratch memory."""
     native = False
     """Whether `evaluate` and `vjp` are kernels, with `response` as their reference, instead of torch."""
+    native_rows = False
+    """Whether the law is one of `analytic_kernels`, which `kernel_rows` describes."""
+    identity = False
+    """Whether the result is always F."""
     adjoint_precision: AdjointPrecision = "single"
     """Precision of the matrix products in `vjp`. "half" uses factors of 11 bits and sums them in float32, for laws
     with such kernels."""
@@ -124,6 +128,10 @@ class Constitutive(nn.Module):
         for total, grad in zip(grad_weights, grads[1:], strict=True):
             total.add_(grad)
         return result, grad_weights
+
+    def kernel_rows(self, F: Tensor, weights: Weights) -> Tensor:
+        """Rows for the kernels of `analytic_kernels` of the dtype and device of F."""
+        raise NotImplementedError
 
     def accumulators(self, F: Tensor, grad_weights: Weights) -> Weights:
         """Zero buffers to which many calls of `vjp` for F (N, 3, 3) add most cheaply, to be reduced by `add_up`.

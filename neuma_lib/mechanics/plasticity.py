@@ -47,6 +47,7 @@ class Identity(Constants, Plasticity, name="identity"):
 
     capturable = True
     native = True
+    identity = True
 
     @staticmethod
     def coefficients():

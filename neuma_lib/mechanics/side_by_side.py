@@ -27,6 +27,7 @@ class SideBySide(Constitutive):
 
     capturable = True
     native = True
+    native_rows = True
 
     def __init__(self, parts: Sequence[Constants], device: torch.device | str = "cpu"):
         super().__init__()
@@ -44,6 +45,13 @@ class SideBySide(Constitutive):
         return torch.cat(
             [part.response(own, ()) for part, own in zip(self.parts, F.chunk(len(self.parts)), strict=True)]
         )
+
+    @property
+    def identity(self) -> bool:
+        return all(part.identity for part in self.parts)
+
+    def kernel_rows(self, F: Tensor, weights: Weights) -> Tensor:
+        return weights[0]
 
     def evaluate(self, F: Tensor, weights: Weights, out: Tensor | None = None) -> Tensor:
         return kernels.evaluate(self.part, F, weights[0], out)

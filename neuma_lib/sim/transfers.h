@@ -5,6 +5,7 @@
 // whose weight is zero. So sums over the last axis of a stencil are products of vectors, and a row is one load or store.
 
 //// start
+    #pragma clang fp contract(on)
     typedef REAL Real;
     typedef Real Four __attribute__((vector_size(4 * sizeof(Real)), aligned(sizeof(Real))));
     typedef Real Eight __attribute__((vector_size(8 * sizeof(Real)), aligned(sizeof(Real))));
@@ -54,6 +55,13 @@
         Columns trial;
         for (int k = 0; k < 3; ++k) trial.c[k] = F_rows.c[k] + dt * times(F_rows, C_rows.c[k]);
         return trial;
+    };
+    // First or later addition to a sum
+    auto add = [](bool first, Row& sum, Real w, const Row& a) INLINE {
+        if (first)
+            sum = w * a;
+        else
+            sum += w * a;
     };
     const Row steps = {0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 0, 0, 0, 0};
 
@@ -197,17 +205,17 @@
         const Stencil s = stencil(px, copy);
         Four wd[3];
         moments(s, wd);
-        Row all = {}, along_i = {}, along_j = {};
+        Row all, along_i, along_j;
         for (int i = 0; i < 3; ++i) {
-            Row sum = {}, moment = {};
+            Row sum, moment;
             for (int j = 0; j < 3; ++j) {
                 const Row row = *(const Row*)((const Four*)grid_v.data + s.first + (i * n + j) * n);
-                sum += s.w[j][1] * row;
-                moment += wd[j][1] * row;
+                add(j == 0, sum, s.w[j][1], row);
+                add(j == 0, moment, wd[j][1], row);
             }
-            all += s.w[i][0] * sum;
-            along_i += wd[i][0] * sum;
-            along_j += s.w[i][0] * moment;
+            add(i == 0, all, s.w[i][0], sum);
+            add(i == 0, along_i, wd[i][0], sum);
+            add(i == 0, along_j, s.w[i][0], moment);
         }
         const Row w = spread(s.w, 2);
         const Four v3 = SHUFFLE(folded(w * all), zero, 0, 1, 2, 4);
@@ -261,23 +269,23 @@
         store_rows((Real*)grad_F.data + 9 * p, grad_F_rows);
         const Four x_new = load3((const Real*)x_after.data + 3 * p);
         Four g_x = load3((const Real*)grad_x.data + 3 * p);
-        g_x = (x_new > zero + c.clamp_low) & (x_new < zero + c.clamp_high) ? g_x : zero;
+        g_x = ((x_new > zero + c.clamp_low) & (x_new < zero + c.clamp_high)) ? g_x : zero;
         const Four g_v = load3((const Real*)grad_v.data + 3 * p) + dt * g_x;
         const Row w = spread(s.w, 2), by_i = repeat(D.c[0]), by_j = repeat(D.c[1]);
-        Row u_i = repeat(g_v - times(D, s.f)) + steps * repeat(D.c[2]), along_i = {}, along_j = {}, along_k = {};
+        Row u_i = repeat(g_v - times(D, s.f)) + steps * repeat(D.c[2]), along_i, along_j, along_k;
         for (int i = 0; i < 3; ++i) {
-            Row u_ij = u_i, sum = {}, sloped = {};
+            Row u_ij = u_i, sum, sloped;
             for (int j = 0; j < 3; ++j) {
                 const size_t at = s.first + (i * n + j) * n;
                 *(Row*)((Four*)grad_grid.data + at) += ((s.w[i][0] * s.w[j][1]) * w) * u_ij;
                 const Row vu = *(const Row*)((const Four*)grid_v.data + at) * u_ij;
-                sum += s.w[j][1] * vu;
-                sloped += slope[j][1] * vu;
+                add(j == 0, sum, s.w[j][1], vu);
+                add(j == 0, sloped, slope[j][1], vu);
                 u_ij += by_j;
             }
-            along_i += slope[i][0] * sum;
-            along_j += s.w[i][0] * sloped;
-            along_k += s.w[i][0] * sum;
+            add(i == 0, along_i, slope[i][0], sum);
+            add(i == 0, along_j, s.w[i][0], sloped);
+            add(i == 0, along_k, s.w[i][0], sum);
             u_i += by_i;
         }
         const Four v_new = load3((const Real*)v_after.data + 3 * p);
@@ -310,23 +318,23 @@
         moments(s, wd);
         const Row w = spread(s.w, 2), by_i = repeat(u.A.c[0]), by_j = repeat(u.A.c[1]);
         Row q_i = repeat(u.q) + steps * repeat(u.A.c[2]);
-        Row all = {}, moment_i = {}, moment_j = {}, along_i = {}, along_j = {}, along_k = {};
+        Row all, moment_i, moment_j, along_i, along_j, along_k;
         for (int i = 0; i < 3; ++i) {
-            Row q_ij = q_i, sum = {}, moment = {}, sum_q = {}, sloped = {};
+            Row q_ij = q_i, sum, moment, sum_q, sloped;
             for (int j = 0; j < 3; ++j) {
                 const Row g = *(const Row*)((const Four*)grad_grid.data + s.first + (i * n + j) * n), gq = g * q_ij;
-                sum += s.w[j][1] * g;
-                moment += wd[j][1] * g;
-                sum_q += s.w[j][1] * gq;
-                sloped += slope[j][1] * gq;
+                add(j == 0, sum, s.w[j][1], g);
+                add(j == 0, moment, wd[j][1], g);
+                add(j == 0, sum_q, s.w[j][1], gq);
+                add(j == 0, sloped, slope[j][1], gq);
                 q_ij += by_j;
             }
-            all += s.w[i][0] * sum;
-            moment_i += wd[i][0] * sum;
-            moment_j += s.w[i][0] * moment;
-            along_i += slope[i][0] * sum_q;
-            along_j += s.w[i][0] * sloped;
-            along_k += s.w[i][0] * sum_q;
+            add(i == 0, all, s.w[i][0], sum);
+            add(i == 0, moment_i, wd[i][0], sum);
+            add(i == 0, moment_j, s.w[i][0], moment);
+            add(i == 0, along_i, slope[i][0], sum_q);
+            add(i == 0, along_j, s.w[i][0], sloped);
+            add(i == 0, along_k, s.w[i][0], sum_q);
             q_i += by_i;
         }
         const Real m = ((const Real*)mass.data)[p];

@@ -369,7 +369,19 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
             grad_v[p] = g_v
         grad_stuck[p] = g_s
 
+    @wp.func_native(
+        """
+    for (int k = 0; k < 9 * added.shape[0]; ++k) ((REAL*)total.data)[k] += ((const REAL*)added.data)[k];
+    """.replace("REAL", {torch.float32: "float", torch.float64: "double"}[dtype])
+    )
+    def add_loop(added: wp.array(dtype=mat33), total: wp.array(dtype=mat33)): ...
+
+    @kernel
+    def add(c: GridConstants, added: wp.array(dtype=mat33), total: wp.array(dtype=mat33)):
+        add_loop(added, total)
+
     return SimpleNamespace(
+        add=add,
         hold=hold,
         touch=touch_obstacles,
         p2g=p2g,

@@ -265,7 +265,7 @@ class Workspace:
     def transfer_to_grid(self, step: int) -> None:
         """From tau and the state of a step to the velocities of the nodes."""
         if self.on_cpu:
-            self._to_grid.run(step)
+            self._steps["to_grid"].run(step)
             return
         cached = self.cached_at(step)
         self.grid[cached].zero_()
@@ -278,7 +278,7 @@ class Workspace:
     def transfer_to_particles(self, step: int) -> None:
         """From velocities of the nodes to x, v, C and the total deformation after the step, and to F_trial."""
         if self.on_cpu:
-            self._to_particles.run(step)
+            self._steps["to_particles"].run(step)
             return
         now, after = self.at(step), self.at(step + 1)
         _run(self._g2p, now, after, self.cached_at(step), step, self.pose_at(step))
@@ -288,12 +288,12 @@ class Workspace:
     def trial_deformation(self, step: int) -> None:
         """Recompute F_trial of a step from the F before and the C after it."""
         if self.on_cpu:
-            self._to_trial.run(step)
+            self._steps["to_trial"].run(step)
             return
         _run(self._trial, self.at(step), self.at(step + 1), self.cached_at(step))
 
     def tracer_launch(self, tracers: Tensor) -> wp.Launch:
-        """A recorded launch, for `move_tracers`, that advects `tracers` (M, 3) in place."""
+        """A recorded launch, for `move_tracers` and `SegmentLoop`, that advects `tracers` (M, 3) in place."""
         positions = wp.from_torch(tracers, dtype=warp_types(self.size.dtype).vec3)
         return self._record(
             self._deformation.advect_tracers, len(tracers), 0, self._rows(self.grid_v), positions
@@ -310,7 +310,7 @@ class Workspace:
         Call it for decreasing steps after clearing `grad_grid` once.
         """
         if self.on_cpu:
-            self._reverse.run(step)
+            self._steps["adjoint"].run(step)
             return
         now, after, cached = self.at(step), self.at(step + 1), self.cached_at(step)
         side = step % 2
@@ -356,19 +356,26 @@ class Workspace:
             **options,
         )
 
-    def _repeated(self, kernel: wp.Kernel, dim: int, *args: Tensor | wp.array, **indices: Index) -> Repeated:
-        """A launch for `LaunchSequence`. The kernel's integer arguments after the constants are indices by name."""
+    def index(self, name: str) -> Index:
+        """How an index of the kernels depends on the step."""
         size = self.size
-        known = {
+        return {
             "now": Index(modulus=size.n_states),
             "after": Index(1, size.n_states),
             "cached": Index(modulus=size.n_cached_steps),
             "pose": Index(modulus=size.n_poses),
             "step": Index(),
-            **indices,
-        }
+        }[name]
+
+    def _repeated(self, kernel: wp.Kernel, dim: int, *args: Tensor | wp.array, **indices: str) -> Repeated:
+        """A launch for `LaunchSequence`. The kernel's integer arguments after the constants are indices by name, or by
+        the name that ``indices`` gives them."""
         labels = [arg.label for arg in kernel.adj.args]
-        numbers = {position: known[label] for position, label in enumerate(labels) if label in known}
+        numbers = {
+            position: self.index(indices.get(label, label))
+            for position, label in enumerate(labels)
+            if label in ("now", "after", "cached", "pose", "step")
+        }
         return Repeated(self._record(kernel, dim, *(0 for _ in numbers), *args), numbers)
 
     @property
@@ -404,27 +411,27 @@ class Workspace:
         return -(-N // BLOCK) * BLOCK if self.sorts else N
 
     def _record_forward_on_cpu(self) -> None:
-        k = transfer_kernels(self.size.dtype, self._features)
-        N, clamps = self.size.particles, bool(self.size.model.clamps)
+        k, N = transfer_kernels(self.size.dtype, self._features), self.size.particles
         held = self.holds, self.clamp
         mass, vol0, radius = self.mass, self.vol0, self.radius
-        if clamps:
+        if self.size.model.clamps:
             mass, vol0, radius = (self._buffer((N,), "real") for _ in range(3))
+        touching = N if self._contact else 1
         self._now = mass, vol0, radius
-        self._v_now = self._buffer((N if self._contact else 1,), "vec3")
-        self._touches = self._buffer((N if self._contact else 1,), dtype=torch.int32)
-        to_grid, to_particles = [], []
-        if clamps:
-            to_grid.append(self._repeated(
+        self._v_now = self._buffer((touching,), "vec3")
+        self._touches = self._buffer((touching,), dtype=torch.int32)
+        self.to_grid = []
+        if self.size.model.clamps:
+            self.to_grid.append(self._repeated(
                 k.hold, N, self.x, self.mass, self.vol0, self.radius, *held, mass, vol0, radius,
                 self.held_mass, self.held_by,
             ))  # fmt: skip
         if self._contact:
-            to_grid.append(self._repeated(
+            self.to_grid.append(self._repeated(
                 k.touch, N, self.x, self.v, radius, self.obstacles, self.distances, self.stuck,
                 self._v_now, self._touches,
             ))  # fmt: skip
-        to_grid += [
+        self.to_grid += [
             self._repeated(
                 k.p2g, 1, self.x, self.v, self.C, self.tau, mass, vol0, self._v_now, self.spans, self.grids
             ),
@@ -432,38 +439,49 @@ class Workspace:
                 k.grid_update, 1, self.spans, self.grids, self.holds, self.held_mass, self.held_by
             ),
         ]
-        to_particles.append(self._repeated(
-            k.g2p, 1, self.grids, mass, self.x, self.v, self.C, self.F, self.F_trial, self.faults
-        ))  # fmt: skip
-        if clamps:
-            to_particles.append(self._repeated(
-                k.move_held, N, self.x, self.v, self.C, self.F, self.F_trial, *held, self.faults
+        self.to_trial = [self._repeated(k.trial_deformation, 1, self.C, self.F, self.F_trial)]
+        self._steps = {
+            "to_grid": LaunchSequence(self.to_grid),
+            "to_particles": LaunchSequence(self.to_particles()),
+            "to_trial": LaunchSequence(self.to_trial),
+        }
+
+    def to_particles(self, elastic: bool = False) -> list[Repeated]:
+        """Launches from velocities of the nodes to the state after a step, whose F is F_trial if ``elastic``."""
+        k, N = transfer_kernels(self.size.dtype, self._features), self.size.particles
+        mass, _, _ = self._now
+        trial = (self.F, {"cached": "after"}) if elastic else (self.F_trial, {})
+        launches = [
+            self._repeated(
+                k.g2p, 1, self.grids, mass, self.x, self.v, self.C, self.F, trial[0], self.faults, **trial[1]
+            )
+        ]
+        if self.size.model.clamps:
+            launches.append(self._repeated(
+                k.move_held, N, self.x, self.v, self.C, self.F, trial[0], self.holds, self.clamp, self.faults,
+                **trial[1],
             ))  # fmt: skip
         if self.size.total:
-            after = Index(1, self.size.n_states)
-            to_particles.append(
-                self._repeated(k.trial_deformation, 1, self.C, self.F_total, self.F_total, cached=after)
-            )
-        self._to_grid, self._to_particles = LaunchSequence(to_grid), LaunchSequence(to_particles)
-        self._to_trial = LaunchSequence(
-            [self._repeated(k.trial_deformation, 1, self.C, self.F, self.F_trial)]
-        )
+            total = self.C, self.F_total, self.F_total
+            launches.append(self._repeated(k.trial_deformation, 1, *total, cached="after"))
+        return launches
 
-    def _record_adjoint_on_cpu(self) -> None:
+    def adjoint(self, elastic: bool = False) -> list[Repeated]:
+        """Launches of `transfer_adjoint`. If ``elastic``, the gradient of F_trial is that of F after the step."""
         k, N = transfer_kernels(self.size.dtype, self._features), self.size.particles
         mass, vol0, radius = self._now
+        grad_F_trial = self.grad_F if elastic else self.grad_F_trial
         launches = []
         if self.size.total:
-            launches.append(self._repeated(
-                self._deformation.total_adjoint, N, self.C, self.F_total, self.grad_C, self.grad_F_total
-            ))  # fmt: skip
+            total = self.C, self.F_total, self.grad_C, self.grad_F_total
+            launches.append(self._repeated(self._deformation.total_adjoint, N, *total))
         launches.append(self._repeated(
             k.g2p_adjoint, 1, self.grids, mass, self.x, self.v, self.C, self.F,
-            self.grad_v, self.grad_C, self.grad_F_trial, self.grad_x, self.grad_F,
+            self.grad_v, self.grad_C, grad_F_trial, self.grad_x, self.grad_F,
         ))  # fmt: skip
         if self.size.model.clamps:
             launches.append(self._repeated(
-                k.held_adjoint, N, self.x, self.C, self.grad_v, self.grad_F_trial, self.grad_x, self.grad_F,
+                k.held_adjoint, N, self.x, self.C, self.grad_v, grad_F_trial, self.grad_x, self.grad_F,
                 self.holds, self.clamp,
             ))  # fmt: skip
         launches += [
@@ -478,7 +496,12 @@ class Workspace:
                 k.touch_adjoint, N, self.x, self.v, radius, self.obstacles, self.distances, self.stuck,
                 self._touches, self.grad_x, self.grad_v, self.grad_stuck,
             ))  # fmt: skip
-        self._reverse = LaunchSequence(launches)
+        return launches
+
+    def _record_adjoint_on_cpu(self) -> None:
+        k = transfer_kernels(self.size.dtype, self._features)
+        self.add_elastic = self._repeated(k.add, 1, self.grad_F_elastic, self.grad_F)
+        self._steps["adjoint"] = LaunchSequence(self.adjoint())
 
     def _record_forward(self) -> None:
         k = forward_kernels(self.size.dtype, self.size.scatter, self._features)

@@ -1,0 +1,154 @@
+"""The steps of a segment in one call on a CPU, if all laws have kernels (`Constitutive.kernel_rows`).
+
+Other laws run in Python between the transfers, step by step (`Simulation.step`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from neuma_lib.mechanics import analytic_kernels
+from neuma_lib.mechanics.law import Constitutive, Weights
+from neuma_lib.sim.sequence import Index, LaunchSequence, Repeated
+from neuma_lib.sim.workspace import Workspace
+
+PARTICLE_STEPS = 1_000_000
+"""Particles times steps in one call, which takes up to 0.3 s on a slow core. Signals wait for its end."""
+
+Parts = Mapping[str, Sequence[tuple[Constitutive, slice, Weights]]]
+"""For elasticity and plasticity: law, particles and weights of each region."""
+
+
+class SegmentLoop:
+    """Forward and reverse loops over the steps of a segment.
+
+    Args:
+        ws: the buffers.
+        parts: laws with kernels.
+        caches_steps: whether the workspace keeps tau and F_trial of all steps.
+        tracers: a launch that moves tracers after each step.
+    """
+
+    def __init__(self, ws: Workspace, parts: Parts, caches_steps: bool, tracers: Repeated | None = None):
+        self._ws, self._parts, self._caches_steps = ws, parts, caches_steps
+        self._rows = {
+            (part, k): law.kernel_rows(ws.F, weights)
+            for part, regions in parts.items()
+            for k, (law, _, weights) in enumerate(regions)
+        }
+        self._elastic = all(law.identity for law, _, _ in parts["plasticity"])
+        self._per_call = max(1, PARTICLE_STEPS // ws.size.particles)
+        after = () if tracers is None else (tracers,)
+        self._forward = LaunchSequence(
+            [*self._stresses(), *ws.to_grid, *ws.to_particles(self._elastic), *self._returns(), *after]
+        )
+        self._reverse: LaunchSequence | None = None
+
+    def advance(self, first: int, steps: int) -> None:
+        """Run steps from ``first`` on."""
+        for n in range(first, first + steps, self._per_call):
+            self._forward.run(n, min(self._per_call, first + steps - n))
+
+    def start_reverse(self) -> None:
+        """Allocate what the reverse loop of a segment needs."""
+        if self._reverse is None:
+            self._reverse = self._reverse_sequence()
+        for partials in self._partials.values():
+            partials.zero_()
+
+    def reverse(self, last: int, steps: int) -> None:
+        """Run the adjoints of steps from ``last`` down."""
+        for n in range(last, last - steps, -self._per_call):
+            self._reverse.run(n, min(self._per_call, n - last + steps), -1)
+
+    def grad_rows(self, part: str, k: int) -> Tensor:
+        """Gradient of the constants of a region's law, summed over the steps since `start_reverse`."""
+        return self._partials[part, k].sum(dim=(0, 2))
+
+    def _reverse_sequence(self) -> LaunchSequence:
+        ws = self._ws
+        steps = max(1, ws.size.n_states - 1)
+        self._partials = {}
+        adjoints: dict[str, list[Repeated]] = {}
+        for part, regions in self._parts.items():
+            F, at = (ws.F, _NOW) if part == "elasticity" else (ws.F_trial, _CACHED)
+            grad_out, grad_F = (
+                (ws.grad_tau, ws.grad_F_elastic) if part == "elasticity" else (ws.grad_F, ws.grad_F_trial)
+            )
+            adjoints[part] = []
+            for k, (_, here, weights) in enumerate(regions):
+                values = dict(F=(F, at), grad_out=(grad_out, None), grad_F=(grad_F, None))
+                extra = {}
+                if weights:
+                    shape = analytic_kernels.partial_shape(self._rows[part, k], here.stop - here.start, F)
+                    self._partials[part, k] = torch.zeros((steps, *shape), dtype=torch.float64)
+                    extra["partials"] = self._partials[part, k]
+                kernel = analytic_kernels.vjp_kernel(part, ws.size.dtype)
+                adjoints[part].append(self._launch(kernel, part, k, values, extra))
+        before = [] if self._caches_steps else [*self._stresses(), *(() if self._elastic else ws.to_trial)]
+        return LaunchSequence(
+            [
+                *before,
+                *ws.to_grid,
+                *(() if self._elastic else adjoints["plasticity"]),
+                *ws.adjoint(self._elastic),
+                *adjoints["elasticity"],
+                ws.add_elastic,
+            ]
+        )
+
+    def _stresses(self) -> list[Repeated]:
+        ws = self._ws
+        kernel = analytic_kernels.evaluate_kernel("elasticity", ws.size.dtype)
+        values = dict(F=(ws.F, _NOW), out=(ws.tau, _CACHED))
+        return [self._launch(kernel, "elasticity", k, values) for k in range(len(self._parts["elasticity"]))]
+
+    def _returns(self) -> list[Repeated]:
+        if self._elastic:
+            return []
+        ws = self._ws
+        kernel = analytic_kernels.evaluate_kernel("plasticity", ws.size.dtype)
+        values = dict(F=(ws.F_trial, _CACHED), out=(ws.F, _AFTER))
+        return [self._launch(kernel, "plasticity", k, values) for k in range(len(self._parts["plasticity"]))]
+
+    def _launch(
+        self,
+        kernel: wp.Kernel,
+        part: str,
+        k: int,
+        values: Mapping[str, tuple[Tensor, str | None]],
+        by_step: Mapping[str, Tensor] = {},
+    ) -> Repeated:
+        """A law's kernel for a region.
+
+        Args:
+            values: argument by name: values of all particles, and the index of their first axis if there is one.
+            by_step: arguments with one item per step of the segment.
+        """
+        ws, rows = self._ws, self._rows[part, k]
+        _, here, _ = self._parts[part][k]
+        labels = [arg.label for arg in kernel.adj.args]
+        given = {"rows": rows.data_ptr(), "copies": len(rows), "n": (here.stop - here.start) // len(rows)}
+        indices = {}
+        for name, (value, at) in values.items():
+            given[name] = (value if at is None else value[0])[here].data_ptr()
+            if at is not None:
+                indices[labels.index(name)] = ws.index(at)._replace(base=given[name], stride=_stride(value))
+        for name, value in by_step.items():
+            given[name] = value.data_ptr()
+            indices[labels.index(name)] = Index(0, len(value), given[name], _stride(value))
+        inputs = [given.get(label, 0) for label in labels]
+        launch = wp.launch(kernel, dim=1, inputs=inputs, device="cpu", block_dim=1, record_cmd=True)
+        return Repeated(launch, indices)
+
+
+_NOW, _AFTER, _CACHED = "now", "after", "cached"
+
+
+def _stride(value: Tensor) -> int:
+    """Bytes between the items of the first axis."""
+    return value.stride(0) * value.element_size()
