@@ -11,6 +11,7 @@
 //
 // `c` points to the row of `analytic_kernels.row`: the index of the law and its coefficients c[1], c[2], ... A vjp sets
 // grad_F[9] and grad_c[COEFFICIENTS], per particle: grad_c[k] is the gradient of c[k + 1]. Particles of a pack share c.
+// A last argument `Pack kept[KEPT]` receives the singular values and vectors of a forward function for its adjoint.
 // Lanes are independent. Those without a particle need any F, and g = 0 if grad_c is summed over lanes.
 //
 // A law is one branch of a function below. With F = U diag(s) V^T it states
@@ -33,9 +34,19 @@
     auto no_gradient = [&](Pack* grad_c) {
         for (int k = 0; k < COEFFICIENTS; ++k) grad_c[k] = zero;
     };
-    // rows u[k], v[k] are the columns of U and V
-    auto decompose = [&](const Pack* F, Pack (*u)[3], Pack (*v)[3], Pack* singular) {
+    // u[k], v[k] are the columns of U and V. `kept` is written, or read if `again`.
+    auto decompose = [&](const Pack* F, Pack (*u)[3], Pack (*v)[3], Pack* singular, Pack* kept, bool again) {
         {ROUND_ALL}
+        if (kept && again) {
+            for (int k = 0; k < 3; ++k) {
+                for (int i = 0; i < 3; ++i) {
+                    u[k][i] = kept[3 * k + i];
+                    v[k][i] = kept[9 + 3 * k + i];
+                }
+                singular[k] = kept[18 + k];
+            }
+            return;
+        }
         Pack a[9];
         for (int k = 0; k < 9; ++k) a[k] = F[k];
         {SVD}
@@ -47,6 +58,14 @@
             v[1][k] = v1[k];
             v[2][k] = v2[k];
             singular[k] = s[k];
+        }
+        if (!kept) return;
+        for (int k = 0; k < 3; ++k) {
+            for (int i = 0; i < 3; ++i) {
+                kept[3 * k + i] = u[k][i];
+                kept[9 + 3 * k + i] = v[k][i];
+            }
+            kept[18 + k] = singular[k];
         }
     };
     // U K V^T
@@ -243,7 +262,7 @@
         slope = c[3] * growth * (bounded ? one : one + exponent + exponent);
         return bounded;
     };
-    auto stress = [&](const Real* c, const Pack* F, Pack* tau) {
+    auto stress = [&](const Real* c, const Pack* F, Pack* tau, Pack* kept = nullptr) {
         const int law = (int)c[0];
         if (is_tensor_law(law)) {
             tensor_stress(c, F, tau);
@@ -251,7 +270,7 @@
         }
         Pack u[3][3], v[3][3], s[3], y[3];
         const Pack gy[3] = {zero, zero, zero};
-        decompose(F, u, v, s);
+        decompose(F, u, v, s, kept, false);
         principal_stress(c, s, false, gy, y, y, y, y);
         Pack along[3], strain, growth, tension = zero, slope;
         if (law == FibreReinforced) fibre(c, F, along, strain, growth, tension, slope);
@@ -262,7 +281,7 @@
                 tau[3 * i + j] = tau[3 * j + i] = value;
             }
     };
-    auto stress_vjp = [&](const Real* c, const Pack* F, const Pack* g, Pack* grad_F, Pack* grad_c) {
+    auto stress_vjp = [&](const Real* c, const Pack* F, const Pack* g, Pack* grad_F, Pack* grad_c, Pack* kept = nullptr) {
         const int law = (int)c[0];
         no_gradient(grad_c);
         if (is_tensor_law(law)) {
@@ -270,7 +289,7 @@
             return;
         }
         Pack u[3][3], v[3][3], s[3], y[3], quotient[3], gs[3], G[3][3], K[3][3];
-        decompose(F, u, v, s);
+        decompose(F, u, v, s, kept, true);
         turn(u, g, u, G);
         const Pack gy[3] = {G[0][0], G[1][1], G[2][2]};
         principal_stress(c, s, true, gy, y, quotient, gs, grad_c);
@@ -437,12 +456,12 @@
         for (int k = 0; k < 5; ++k) grad_c[k] = yields ? ga * a_c[k] + gb * b_c[k] : zero;
         return true;
     };
-    auto return_map = [&](const Real* c, const Pack* F, Pack* out) {
+    auto return_map = [&](const Real* c, const Pack* F, Pack* out, Pack* kept = nullptr) {
         Pack u[3][3], v[3][3], s[3], y[3];
         Mask yields;
         for (int k = 0; k < 9; ++k) out[k] = F[k];
         if ((int)c[0] == Identity) return;
-        decompose(F, u, v, s);
+        decompose(F, u, v, s, kept, false);
         const Pack gy[3] = {zero, zero, zero};
         if (!principal_return(c, s, false, gy, y, yields, y, y, y)) return;
         yields = yields & ((y[0] != s[0]) | (y[1] != s[1]) | (y[2] != s[2]));
@@ -452,13 +471,13 @@
                 out[3 * i + j] = yields ? value : out[3 * i + j];
             }
     };
-    auto return_vjp = [&](const Real* c, const Pack* F, const Pack* g, Pack* grad_F, Pack* grad_c) {
+    auto return_vjp = [&](const Real* c, const Pack* F, const Pack* g, Pack* grad_F, Pack* grad_c, Pack* kept = nullptr) {
         Pack u[3][3], v[3][3], s[3], y[3], quotient[3], gs[3], G[3][3], K[3][3], back[9];
         Mask yields;
         no_gradient(grad_c);
         for (int k = 0; k < 9; ++k) grad_F[k] = g[k];
         if ((int)c[0] == Identity) return;
-        decompose(F, u, v, s);
+        decompose(F, u, v, s, kept, true);
         turn(u, g, v, G);
         const Pack gy[3] = {G[0][0], G[1][1], G[2][2]};
         if (!principal_return(c, s, true, gy, y, yields, quotient, gs, grad_c)) return;
@@ -500,18 +519,19 @@
         const int used = n - begin < WIDTH ? n - begin : WIDTH;
 #endif
         const Real* const c = (const Real*)rows + (COEFFICIENTS + 1) * copy;
+        Pack* const kept = cache ? (Pack*)cache + KEPT * pack : nullptr;
         Pack x[9], value[9];
         load(F, first, used, x);
 
 //// evaluate
-        FORWARD(c, x, value);
+        FORWARD(c, x, value, kept);
         store(out, first, used, value);
     }
 
 //// vjp
         Pack g[9], grad_c[COEFFICIENTS];
         load(grad_out, first, used, g);
-        VJP(c, x, g, value, grad_c);
+        VJP(c, x, g, value, grad_c, kept);
         store(grad_F, first, used, value);
         if (partials)
             for (int k = 0; k < COEFFICIENTS; ++k) {

@@ -13,8 +13,9 @@ import warp as wp
 from torch import Tensor
 
 from neuma_lib.device import native_source, start_warp
-from neuma_lib.mechanics.fused_launch import contiguous, launch_blocks
+from neuma_lib.mechanics.fused_launch import launch_blocks
 from neuma_lib.mechanics.singular_values_kernels import (
+    CPU_WIDTH,
     END,
     FUSE,
     MATH,
@@ -55,8 +56,11 @@ LAWS = (
     "CohesiveDruckerPrager",
 )
 """Names of the classes of laws with kernels, in the order of their indices."""
+WITHOUT_SINGULAR_VALUES = {"StVK", "NeoHookean", "Fluid", "Identity"}
 COEFFICIENTS = 7
 """Largest number of coefficients of a law."""
+KEPT = 21
+"""Numbers per row in a cache: U, V and the singular values."""
 THREADS = 64
 """Threads per block on a GPU."""
 
@@ -71,7 +75,9 @@ def row(law: str, coefficients: tuple[Tensor | float, ...]) -> Tensor:
 def laws(dtype: torch.dtype) -> str:
     """C++ source that defines `stress`, `return_map` and their adjoints, see ``analytic_kernels.h``."""
     parts = native_source(__file__, ".h")
-    constants = f"    enum {{ {', '.join(LAWS)} }};\n    const int COEFFICIENTS = {COEFFICIENTS};\n"
+    constants = (
+        f"    enum {{ {', '.join(LAWS)} }};\n    const int COEFFICIENTS = {COEFFICIENTS}, KEPT = {KEPT};\n"
+    )
     for name, value in (("STRETCH_MIN", STRETCH_MIN), ("FIBRE_EXPONENT_MAX", FIBRE_EXPONENT_MAX)):
         constants += f"    const Real {name} = Real({value!r});\n"
     text = FUSE + TYPES + constants + MATH + parts["functions"] + parts["elasticity"] + parts["plasticity"]
@@ -88,42 +94,48 @@ def source(kind: Kind, backward: bool, dtype: torch.dtype) -> str:
 
 @cache
 def evaluate_kernel(kind: Kind, dtype: torch.dtype):
-    """Kernel (F (copies n, 3, 3), rows, copies, n, out), launched by `launch_blocks`."""
+    """Kernel (F (copies n, 3, 3), rows, copies, n, cache, out), launched by `launch_blocks`."""
 
     @wp.func_native(source(kind, False, dtype))
-    def evaluate_rows(F: wp.uint64, rows: wp.uint64, copies: int, n: int, out: wp.uint64): ...
+    def evaluate_rows(
+        F: wp.uint64, rows: wp.uint64, copies: int, n: int, cache: wp.uint64, out: wp.uint64
+    ): ...
 
     @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
-    def analytic_evaluate(F: wp.uint64, rows: wp.uint64, copies: int, n: int, out: wp.uint64):
-        evaluate_rows(F, rows, copies, n, out)
+    def analytic_evaluate(
+        F: wp.uint64, rows: wp.uint64, copies: int, n: int, cache: wp.uint64, out: wp.uint64
+    ):
+        evaluate_rows(F, rows, copies, n, cache, out)
 
     return analytic_evaluate
 
 
 @cache
 def vjp_kernel(kind: Kind, dtype: torch.dtype):
-    """Kernel (F (copies n, 3, 3), rows, copies, n, grad_out, grad_F, partials), launched by `launch_blocks`.
+    """Kernel (F (copies n, 3, 3), rows, copies, n, cache, grad_out, grad_F, partials), launched by `launch_blocks`.
 
     It writes sums of the gradients of the coefficients over packs to partials (packs, COEFFICIENTS) if these are given.
     """
 
     @wp.func_native(source(kind, True, dtype))
     def vjp_rows(
-        F: wp.uint64, rows: wp.uint64, copies: int, n: int, grad_out: wp.uint64, grad_F: wp.uint64, partials: wp.uint64
+        F: wp.uint64, rows: wp.uint64, copies: int, n: int, cache: wp.uint64, grad_out: wp.uint64, grad_F: wp.uint64,
+        partials: wp.uint64,
     ): ...  # fmt: skip
 
     @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
     def analytic_vjp(
-        F: wp.uint64, rows: wp.uint64, copies: int, n: int, grad_out: wp.uint64, grad_F: wp.uint64, partials: wp.uint64
+        F: wp.uint64, rows: wp.uint64, copies: int, n: int, cache: wp.uint64, grad_out: wp.uint64, grad_F: wp.uint64,
+        partials: wp.uint64,
     ):  # fmt: skip
-        vjp_rows(F, rows, copies, n, grad_out, grad_F, partials)
+        vjp_rows(F, rows, copies, n, cache, grad_out, grad_F, partials)
 
     return analytic_vjp
 
 
-def partial_shape(rows: Tensor, n: int, F: Tensor) -> tuple[int, int, int]:
-    """Shape of the partials of a vjp for n rows like F."""
-    return len(rows), pack_count(n // len(rows), F.device, F.dtype), COEFFICIENTS
+def partial_shape(copies: int, n: int, F: Tensor) -> tuple[int, int, int]:
+    """Shape (copies, packs, COEFFICIENTS) of the partials of a vjp for n rows like F of all copies."""
+    return copies, pack_count(n // copies, F.device, F.dtype), COEFFICIENTS
 
 
 def _blocks(F: Tensor) -> int:
@@ -131,46 +143,60 @@ def _blocks(F: Tensor) -> int:
     return 1 if F.device.type == "cpu" else -(-len(F) // THREADS)
 
 
-@torch.no_grad()
-def evaluate(kind: Kind, F: Tensor, rows: Tensor, out: Tensor | None = None) -> Tensor:
+def cache_shape(copies: int, n: int, F: Tensor) -> tuple[int, int, int]:
+    """Shape (packs, KEPT, CPU_WIDTH) of memory for the SVD of n rows like F of all copies on a CPU."""
+    return copies * pack_count(n // copies, F.device, F.dtype), KEPT, CPU_WIDTH[F.dtype]
+
+
+def new_cache(F: Tensor, copies: int) -> Tensor | None:
+    """Memory for the SVD of F (copies n, 3, 3) on a CPU, None on a GPU."""
+    return F.new_empty(cache_shape(copies, len(F), F)) if F.device.type == "cpu" else None
+
+
+def evaluate(
+    kind: Kind, F: Tensor, rows: Tensor, out: Tensor | None = None, cache: Tensor | None = None
+) -> Tensor:
     """Stress or return map of F (copies n, 3, 3), of which each n rows follow one of rows (copies, 1 + COEFFICIENTS).
 
-    ``rows`` has the dtype and device of F.
+    Args:
+        rows: of the dtype and device of F.
+        out: (copies n, 3, 3), receives the result if given.
+        cache: result of `new_cache`, receives the SVD if given.
     """
-    F = F.detach().contiguous()
+    F, rows = F.detach().contiguous(), rows.detach().contiguous()
     out = torch.empty_like(F) if out is None else out
-    with contiguous(out) as (result,):
-        if len(F):
-            inputs = F, rows.detach().contiguous(), len(rows), len(F) // len(rows), result
-            launch_blocks(evaluate_kernel(kind, F.dtype), _blocks(F), THREADS, *inputs)
-    return out
+    result = out if out.is_contiguous() else torch.empty_like(F)
+    if len(F):
+        inputs = F, rows, len(rows), len(F) // len(rows), cache, result
+        launch_blocks(evaluate_kernel(kind, F.dtype), _blocks(F), THREADS, *inputs)
+    return out if result is out else out.copy_(result)
 
 
-@torch.no_grad()
 def vjp(
     kind: Kind,
     F: Tensor,
     rows: Tensor,
     grad_out: Tensor,
+    cache: Tensor | None = None,
     grad_F: Tensor | None = None,
     grad_rows: Tensor | None = None,
 ) -> Tensor:
     """Gradient of F. The gradient of ``rows`` is added to ``grad_rows`` (copies, 1 + COEFFICIENTS) if given.
 
-    Its sums over particles are in float64 and do not depend on the number of threads.
+    ``cache`` is that of `evaluate` for the same F. Sums over particles are in float64 in a fixed order.
     """
-    F, grad_out = F.detach().contiguous(), grad_out.contiguous()
+    F, rows, grad_out = (x.detach().contiguous() for x in (F, rows, grad_out))
     grad_F = torch.empty_like(F) if grad_F is None else grad_F
-    with contiguous(grad_F) as (result,):
-        if len(F):
-            copies, n = len(rows), len(F) // len(rows)
-            partials = None
-            if grad_rows is not None:
-                shape = copies, pack_count(n, F.device, F.dtype), COEFFICIENTS
-                partials = torch.empty(shape, dtype=torch.float64, device=F.device)
-            address = 0 if partials is None else partials.data_ptr()
-            inputs = F, rows.detach().contiguous(), copies, n, grad_out, result, address
-            launch_blocks(vjp_kernel(kind, F.dtype), _blocks(F), THREADS, *inputs)
-            if partials is not None:
-                grad_rows[:, 1:] += partials.sum(1)
-    return grad_F
+    result = grad_F if grad_F.is_contiguous() else torch.empty_like(F)
+    if len(F):
+        copies, n = len(rows), len(F) // len(rows)
+        partials = None
+        if grad_rows is not None:
+            shape = partial_shape(copies, len(F), F)
+            partials = torch.empty(shape, dtype=torch.float64, device=F.device)
+        address = 0 if partials is None else partials.data_ptr()
+        inputs = F, rows, copies, n, cache, grad_out, result, address
+        launch_blocks(vjp_kernel(kind, F.dtype), _blocks(F), THREADS, *inputs)
+        if partials is not None:
+            grad_rows[:, 1:] += partials.sum(1)
+    return grad_F if result is grad_F else grad_F.copy_(result)

@@ -198,28 +198,33 @@ class Constants(nn.Module):
     def native_rows(self) -> bool:
         return self.native
 
+    @property
+    def keeps_singular_values(self) -> bool:
+        return self.native and type(self).__name__ not in kernels.WITHOUT_SINGULAR_VALUES
+
     def kernel_rows(self, F: Tensor, weights: tuple[Tensor, ...]) -> Tensor:
         return self._rows(F, weights)
 
     def _rows(self, F: Tensor, weights: tuple[Tensor, ...]) -> Tensor:
-        """Rows (1, 1 + COEFFICIENTS) for F, kept while the weights do not change."""
-        used = tuple((w, w._version) for w in weights)
-        key, rows = self.__dict__.get("_kept", (None, None))
-        state = len(weights), F.dtype, F.device
-        if (
-            key is None
-            or key[0] != state
-            or any(a is not b or n != m for (a, n), (b, m) in zip(key[1], used, strict=True))
-        ):
+        """Rows (1, 1 + COEFFICIENTS) for F, kept while neither the weights nor the dtype and device change."""
+        state = F.dtype, F.device, [w._version for w in weights]
+        kept = self.__dict__.get("_kept")
+        if kept is None or kept[0] != state or not _same(kept[1], weights):
             with torch.no_grad():
                 rows = self.row(weights)[None].to(F.device, F.dtype)
-            self.__dict__["_kept"] = (state, used), rows
-        return rows
+            self.__dict__["_kept"] = kept = state, weights, rows
+        return kept[2]
 
     def evaluate(self, F: Tensor, weights: tuple[Tensor, ...], out: Tensor | None = None) -> Tensor:
         if not self.native:
             return super().evaluate(F, weights, out)
         return kernels.evaluate(self.part, F, self._rows(F, weights), out)
+
+    def evaluate_with_cache(self, F, weights, out=None, cache=None):
+        if not self.keeps_singular_values:
+            return self.evaluate(F, weights, out), None
+        cache = kernels.new_cache(F, 1) if cache is None else cache
+        return kernels.evaluate(self.part, F, self._rows(F, weights), out, cache), cache
 
     def vjp(self, F, weights, grad_out, cache=None, grad_F=None, grad_weights=None):
         if not self.native:
@@ -227,12 +232,11 @@ class Constants(nn.Module):
         if grad_weights is None:
             grad_weights = tuple(torch.zeros_like(w) for w in weights)
         sums = grad_weights if _are_rows(grad_weights) else self.accumulators(F, grad_weights)
-        result = kernels.vjp(
-            self.part, F, self._rows(F, weights), grad_out, grad_F, sums[0] if weights else None
-        )
+        grad_rows = sums[0] if weights else None
+        grad_F = kernels.vjp(self.part, F, self._rows(F, weights), grad_out, cache, grad_F, grad_rows)
         if sums is not grad_weights:
             self.add_up(sums, weights, grad_weights)
-        return result, grad_weights
+        return grad_F, grad_weights
 
     def accumulators(self, F, grad_weights):
         if not self.native or not grad_weights:
@@ -254,3 +258,7 @@ class Constants(nn.Module):
 def _are_rows(accumulators: tuple[Tensor, ...]) -> bool:
     """Whether these are gradients of rows instead of constants."""
     return len(accumulators) == 1 and accumulators[0].ndim == 2
+
+
+def _same(one: tuple[Tensor, ...], other: tuple[Tensor, ...]) -> bool:
+    return len(one) == len(other) and all(a is b for a, b in zip(one, other, strict=True))

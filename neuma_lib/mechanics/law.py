@@ -39,6 +39,8 @@ class Constitutive(nn.Module):
     """Whether `evaluate` and `vjp` are kernels, with `response` as their reference, instead of torch."""
     native_rows = False
     """Whether the law is one of `analytic_kernels`, which `kernel_rows` describes."""
+    keeps_singular_values = False
+    """Whether these kernels can keep singular values for the adjoint (`analytic_kernels.new_cache`)."""
     identity = False
     """Whether the result is always F."""
     adjoint_precision: AdjointPrecision = "single"

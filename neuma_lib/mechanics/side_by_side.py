@@ -50,15 +50,25 @@ class SideBySide(Constitutive):
     def identity(self) -> bool:
         return all(part.identity for part in self.parts)
 
+    @property
+    def keeps_singular_values(self) -> bool:
+        return any(part.keeps_singular_values for part in self.parts)
+
     def kernel_rows(self, F: Tensor, weights: Weights) -> Tensor:
         return weights[0]
 
     def evaluate(self, F: Tensor, weights: Weights, out: Tensor | None = None) -> Tensor:
         return kernels.evaluate(self.part, F, weights[0], out)
 
+    def evaluate_with_cache(self, F, weights, out=None, cache=None):
+        if not self.keeps_singular_values:
+            return self.evaluate(F, weights, out), None
+        cache = kernels.new_cache(F, len(self.parts)) if cache is None else cache
+        return kernels.evaluate(self.part, F, weights[0], out, cache), cache
+
     def vjp(self, F, weights, grad_out, cache=None, grad_F=None, grad_weights=None):
         grad_weights = (torch.zeros_like(weights[0]),) if grad_weights is None else grad_weights
-        return kernels.vjp(self.part, F, weights[0], grad_out, grad_F, grad_weights[0]), grad_weights
+        return kernels.vjp(self.part, F, weights[0], grad_out, cache, grad_F, grad_weights[0]), grad_weights
 
 
 def fusible(law: Law) -> bool:

@@ -31,7 +31,7 @@ def rollout_batch(
 ) -> list[Trajectory | None]:
     """`rollout` for each of several laws, equal to round-off, without gradients and in fewer launches.
 
-    Analytic laws with kernels (`analytic_fused`) are evaluated in one launch for any kinds and constants. Other laws
+    Analytic laws with kernels (`analytic_kernels`) are evaluated in one launch for any kinds and constants. Other laws
     share only the transfers.
 
     Args:

@@ -96,6 +96,12 @@ def _warn_of_another_grid(name: str, learned: int, used: int) -> None:
     )
 
 
+@cache
+def _log_evaluation(law: str, native: bool) -> None:
+    """Log once how a law is evaluated."""
+    _LOGGER.info("%s is evaluated by %s", law, "native kernels" if native else "torch, which is slower")
+
+
 def simulate(
     mpm: MPM,
     law: Law | Sequence[MaterialRegion],
@@ -155,6 +161,10 @@ def fly_and_simulate(
     Returns one error per copy, or None. The states of a copy with an error are undefined. If all copies have one, the
     first is raised.
     """
+    for region in regions:
+        for part in (region.law.elasticity, region.law.plasticity):
+            for own in getattr(part, "parts", (part,)):
+                _log_evaluation(type(own).__name__, own.native)
     first = free_flight_steps(model, regions, state, frames[-1], copies) if skip_free_flight else 0
     more = {"F_total": state.F} if total else {}
     if model.contact == "particles":

@@ -5,6 +5,7 @@ Other laws run in Python between the transfers, step by step (`Simulation.step`)
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import torch
@@ -30,16 +31,25 @@ class SegmentLoop:
         ws: the buffers.
         parts: laws with kernels.
         caches_steps: whether the workspace keeps tau and F_trial of all steps.
+        cache_bytes: memory for singular values, which are kept for a region if those of all steps fit.
         tracers: a launch that moves tracers after each step.
     """
 
-    def __init__(self, ws: Workspace, parts: Parts, caches_steps: bool, tracers: Repeated | None = None):
+    def __init__(
+        self,
+        ws: Workspace,
+        parts: Parts,
+        caches_steps: bool,
+        cache_bytes: float,
+        tracers: Repeated | None = None,
+    ):
         self._ws, self._parts, self._caches_steps = ws, parts, caches_steps
         self._rows = {
             (part, k): law.kernel_rows(ws.F, weights)
             for part, regions in parts.items()
             for k, (law, _, weights) in enumerate(regions)
         }
+        self._caches = self._new_caches(cache_bytes) if ws.size.differentiable else {}
         self._elastic = all(law.identity for law, _, _ in parts["plasticity"])
         self._per_call = max(1, PARTICLE_STEPS // ws.size.particles)
         after = () if tracers is None else (tracers,)
@@ -84,7 +94,9 @@ class SegmentLoop:
                 values = dict(F=(F, at), grad_out=(grad_out, None), grad_F=(grad_F, None))
                 extra = {}
                 if weights:
-                    shape = analytic_kernels.partial_shape(self._rows[part, k], here.stop - here.start, F)
+                    shape = analytic_kernels.partial_shape(
+                        len(self._rows[part, k]), here.stop - here.start, F
+                    )
                     self._partials[part, k] = torch.zeros((steps, *shape), dtype=torch.float64)
                     extra["partials"] = self._partials[part, k]
                 kernel = analytic_kernels.vjp_kernel(part, ws.size.dtype)
@@ -100,6 +112,25 @@ class SegmentLoop:
                 ws.add_elastic,
             ]
         )
+
+    def _new_caches(self, cache_bytes: float) -> dict[tuple[str, int], Tensor]:
+        """Memory for singular values by region, which later rollouts of the workspace use again."""
+        ws, caches = self._ws, {}
+        for (part, k), rows in self._rows.items():
+            law, here, _ = self._parts[part][k]
+            if not law.keeps_singular_values or part == "plasticity" and not self._caches_steps:
+                continue
+            shape = (
+                ws.size.n_cached_steps,
+                *analytic_kernels.cache_shape(len(rows), here.stop - here.start, ws.F),
+            )
+            cache_bytes -= math.prod(shape) * ws.F.element_size() if self._caches_steps else 0
+            if cache_bytes >= 0:
+                key = "segment", part, shape
+                if key not in ws.law_caches:
+                    ws.law_caches[key] = ws.F.new_empty(shape)
+                caches[part, k] = ws.law_caches[key]
+        return caches
 
     def _stresses(self) -> list[Repeated]:
         ws = self._ws
@@ -138,6 +169,8 @@ class SegmentLoop:
             given[name] = (value if at is None else value[0])[here].data_ptr()
             if at is not None:
                 indices[labels.index(name)] = ws.index(at)._replace(base=given[name], stride=_stride(value))
+        if (part, k) in self._caches:
+            by_step = {**by_step, "cache": self._caches[part, k]}
         for name, value in by_step.items():
             given[name] = value.data_ptr()
             indices[labels.index(name)] = Index(0, len(value), given[name], _stride(value))

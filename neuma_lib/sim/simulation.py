@@ -249,7 +249,7 @@ class Simulation:
                 for part in PARTS
             }
             caches_steps = self.plan is not None and self.plan.caches_steps
-            self._loop = SegmentLoop(self.workspace, parts, caches_steps, tracers)
+            self._loop = SegmentLoop(self.workspace, parts, caches_steps, self._law_cache_bytes, tracers)
 
     def _advance(
         self, steps: int, weights: Sequence[Tensor], passive: _Tracers | None = None, first: int = 0
