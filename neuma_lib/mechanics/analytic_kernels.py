@@ -24,7 +24,6 @@ from neuma_lib.mechanics.singular_values_kernels import (
     TYPES,
     filled,
     pack_count,
-    warp_types,
 )
 
 start_warp()
@@ -75,7 +74,9 @@ def row(law: str, coefficients: tuple[Tensor | float, ...]) -> Tensor:
 def laws(dtype: torch.dtype) -> str:
     """C++ source that defines `stress`, `return_map` and their adjoints, see ``analytic_kernels.h``."""
     parts = native_source(__file__, ".h")
-    constants = f"    enum {{ {', '.join(LAWS)} }};\n    const int COEFFICIENTS = {COEFFICIENTS}, KEPT = {KEPT};\n"
+    constants = (
+        f"    enum {{ {', '.join(LAWS)} }};\n    const int COEFFICIENTS = {COEFFICIENTS}, KEPT = {KEPT};\n"
+    )
     for name, value in (("STRETCH_MIN", STRETCH_MIN), ("FIBRE_EXPONENT_MAX", FIBRE_EXPONENT_MAX)):
         constants += f"    const Real {name} = Real({value!r});\n"
     text = FUSE + TYPES + constants + MATH + parts["functions"] + parts["elasticity"] + parts["plasticity"]
@@ -86,6 +87,7 @@ def source(kind: Kind, backward: bool, dtype: torch.dtype) -> str:
     """C++ source of the body of a kernel."""
     parts = native_source(__file__, ".h")
     text = parts["rows"] + parts["vjp" if backward else "evaluate"] + END
+    text = f"    const int THREADS = {THREADS};\n" + text
     forward, vjp = ("stress", "stress_vjp") if kind == "elasticity" else ("return_map", "return_vjp")
     return laws(dtype) + text.replace("FORWARD", forward).replace("VJP", vjp)
 
@@ -95,10 +97,14 @@ def evaluate_kernel(kind: Kind, dtype: torch.dtype):
     """Kernel (F (copies n, 3, 3), rows, copies, n, cache, out), launched by `launch_blocks`."""
 
     @wp.func_native(source(kind, False, dtype))
-    def evaluate_rows(F: wp.uint64, rows: wp.uint64, copies: int, n: int, cache: wp.uint64, out: wp.uint64): ...
+    def evaluate_rows(
+        F: wp.uint64, rows: wp.uint64, copies: int, n: int, cache: wp.uint64, out: wp.uint64
+    ): ...
 
     @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
-    def analytic_evaluate(F: wp.uint64, rows: wp.uint64, copies: int, n: int, cache: wp.uint64, out: wp.uint64):
+    def analytic_evaluate(
+        F: wp.uint64, rows: wp.uint64, copies: int, n: int, cache: wp.uint64, out: wp.uint64
+    ):
         evaluate_rows(F, rows, copies, n, cache, out)
 
     return analytic_evaluate

@@ -204,7 +204,10 @@ class FibreReinforced(Hencky, name="fibre_reinforced"):
         constants = self.with_weights(weights)
         mu, lam = lame(constants["E"], constants["nu"])
         a_F = F @ _direction(
-            *(torch.as_tensor(constants[key], dtype=F.dtype, device=F.device) for key in ("azimuth", "elevation"))
+            *(
+                torch.as_tensor(constants[key], dtype=F.dtype, device=F.device)
+                for key in ("azimuth", "elevation")
+            )
         )
         strain = (a_F**2).sum(1) - 1
         exponent = (constants["fibre_exponent"] * strain**2).clamp(max=FIBRE_EXPONENT_MAX)
