@@ -507,7 +507,7 @@
             for (int k = 0; k < 9; ++k) p[9 * l + k] = LANE(x[k], l);
     };
 #if defined(__CUDA_ARCH__)
-    const size_t pack = blockIdx.x * (size_t)blockDim.x + threadIdx.x;
+    const size_t pack = blockIdx.x * (size_t)THREADS + threadIdx.x;
     if (pack >= copies * (size_t)n) return;
     {
         const int used = 1;

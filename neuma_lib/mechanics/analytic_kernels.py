@@ -24,7 +24,6 @@ from neuma_lib.mechanics.singular_values_kernels import (
     TYPES,
     filled,
     pack_count,
-    warp_types,
 )
 
 start_warp()
@@ -88,6 +87,7 @@ def source(kind: Kind, backward: bool, dtype: torch.dtype) -> str:
     """C++ source of the body of a kernel."""
     parts = native_source(__file__, ".h")
     text = parts["rows"] + parts["vjp" if backward else "evaluate"] + END
+    text = f"    const int THREADS = {THREADS};\n" + text
     forward, vjp = ("stress", "stress_vjp") if kind == "elasticity" else ("return_map", "return_vjp")
     return laws(dtype) + text.replace("FORWARD", forward).replace("VJP", vjp)
 

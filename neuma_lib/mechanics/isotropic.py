@@ -248,10 +248,8 @@ class Constants(nn.Module):
             return
         with torch.enable_grad():
             leaves = [w.detach().requires_grad_() for w in weights]
-            row = self.row(tuple(leaves))
-        for total, grad in zip(
-            grad_weights, torch.autograd.grad(row, leaves, accumulators[0][0]), strict=True
-        ):
+            grads = torch.autograd.grad(self.row(tuple(leaves)), leaves, accumulators[0][0])
+        for total, grad in zip(grad_weights, grads, strict=True):
             total.add_(grad)
 
 

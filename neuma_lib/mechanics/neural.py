@@ -148,15 +148,8 @@ class NeuralConstitutive(AdaptableConstitutive):
 
     def _network(self, F: Tensor, weights: Weights, state: _Forward) -> None:
         """Fill ``state`` from the rows F."""
-        launch(
-            feature_kernel(F.dtype),
-            pack_count(len(F), F.device, F.dtype),
-            F,
-            state.z,
-            state.R,
-            state.Vh,
-            len(F),
-        )
+        packs = pack_count(len(F), F.device, F.dtype)
+        launch(feature_kernel(F.dtype), packs, F, state.z, state.R, state.Vh, len(F))
         W0, W1, W2 = weights
         torch.mm(state.z, W0.mT, out=state.a0)
         aten.gelu.out(state.a0, out=state.h0)

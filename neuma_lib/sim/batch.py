@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import torch
 
 from neuma_lib.errors import InputError, NonFiniteError
-from neuma_lib.mechanics.side_by_side import fusible, side_by_side
 from neuma_lib.mechanics.law import Law
+from neuma_lib.mechanics.side_by_side import fusible, side_by_side
 from neuma_lib.sim.model import MPM, MaterialRegion
 from neuma_lib.sim.rollout import check_inside, checked_frames, fly_and_simulate
 from neuma_lib.sim.state import State, Trajectory
