@@ -2,8 +2,8 @@
 
 ``transfers.h`` has the loops. They compute what `kernels` and `adjoint_kernels` do, with three differences:
 
-- Nodes that no particle touches are neither cleared nor updated. ``spans`` (copies, 4, nodes^2) has the first and last
-  node in each row of the grid, once for the first nodes of particles and once for all.
+- Nodes that no particle touches are neither cleared nor updated. ``spans`` (copies, 6, nodes^2) has the first and last
+  in each row of the grid.
 - Grids of earlier steps are not kept. The reverse loop computes them again, which takes less time than the laws.
 - Contact and clamps are passes over the particles before and after the loops, with the functions of other devices.
   Clamped particles have no mass in ``mass_now``.
@@ -54,19 +54,19 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
     module = f"neuma_lib.sim.transfers_{str(dtype).removeprefix('torch.')}_{'_'.join(features)}"
     kernel = functools.partial(wp.kernel, enable_backward=False, module=module)
 
-    @wp.func_native(_native(dtype, "lines", "stencil", "spans", "momentum", "p2g"))
+    @wp.func_native(_native(dtype, "lanes", "block", "spans", "momentum", "p2g"))
     def p2g_loop(
         c: GridConstants, x: wp.array(dtype=vec3), v: wp.array(dtype=vec3), C: wp.array(dtype=mat33),
         tau: wp.array(dtype=mat33), mass: wp.array(dtype=real), vol0: wp.array(dtype=real),
         spans: wp.array(dtype=wp.int32), grid: wp.array2d(dtype=vec4),
     ): ...  # fmt: skip
 
-    @wp.func_native(_native(dtype, "lines", "grid_update"))
+    @wp.func_native(_native(dtype, "grid_update"))
     def grid_loop(
         c: GridConstants, spans: wp.array(dtype=wp.int32), grid: wp.array(dtype=vec4), grid_v: wp.array(dtype=vec4)
     ): ...  # fmt: skip
 
-    @wp.func_native(_native(dtype, "stencil", "g2p", held=clamps))
+    @wp.func_native(_native(dtype, "lanes", "block", "g2p", held=clamps))
     def g2p_loop(
         c: GridConstants, step: wp.int32, mass: wp.array(dtype=real), grid_v: wp.array(dtype=vec4),
         x: wp.array(dtype=vec3), F: wp.array(dtype=mat33), x_after: wp.array(dtype=vec3),
@@ -79,7 +79,7 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         c: GridConstants, C_after: wp.array(dtype=mat33), F: wp.array(dtype=mat33), F_trial: wp.array(dtype=mat33)
     ): ...  # fmt: skip
 
-    @wp.func_native(_native(dtype, "stencil", "g2p_adjoint", held=clamps))
+    @wp.func_native(_native(dtype, "lanes", "block", "g2p_adjoint", held=clamps))
     def g2p_adjoint_loop(
         c: GridConstants, mass: wp.array(dtype=real), grid_v: wp.array(dtype=vec4), x: wp.array(dtype=vec3),
         F: wp.array(dtype=mat33), x_after: wp.array(dtype=vec3), v_after: wp.array(dtype=vec3),
@@ -88,13 +88,13 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         grad_grid: wp.array(dtype=vec4),
     ): ...  # fmt: skip
 
-    @wp.func_native(_native(dtype, "lines", "grid_adjoint"))
+    @wp.func_native(_native(dtype, "grid_adjoint"))
     def grid_adjoint_loop(
         c: GridConstants, spans: wp.array(dtype=wp.int32), grid: wp.array(dtype=vec4),
         grad_grid: wp.array(dtype=vec4),
     ): ...  # fmt: skip
 
-    @wp.func_native(_native(dtype, "stencil", "momentum", "p2g_adjoint"))
+    @wp.func_native(_native(dtype, "lanes", "block", "momentum", "p2g_adjoint"))
     def p2g_adjoint_loop(
         c: GridConstants, x: wp.array(dtype=vec3), v: wp.array(dtype=vec3), C: wp.array(dtype=mat33),
         tau: wp.array(dtype=mat33), mass: wp.array(dtype=real), vol0: wp.array(dtype=real),
@@ -130,6 +130,18 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
             vol_now[p] = real(0.0)
             radius_now[p] = real(wp.static(NO_CONTACT))
 
+    @wp.func_native(_native(dtype, "lanes", "near"))
+    def near_obstacles(
+        c: GridConstants, others: wp.int32, x: wp.array(dtype=vec3), v: wp.array(dtype=vec3),
+        radius: wp.array(dtype=real), v_now: wp.array(dtype=vec3), stuck: wp.array(dtype=vec3),
+        near: wp.array(dtype=wp.int32),
+    ) -> wp.int32: ...  # fmt: skip
+
+    @wp.func_native(_native(dtype, "far"))
+    def clear_far(
+        c: GridConstants, near: wp.array(dtype=wp.int32), count: wp.int32, grad_stuck: wp.array(dtype=vec3)
+    ): ...
+
     @kernel
     def touch_obstacles(
         c: GridConstants,
@@ -143,17 +155,29 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         distances: wp.array(dtype=real),
         stuck: wp.array2d(dtype=vec3),
         v_now: wp.array(dtype=vec3),
-        touches: wp.array(dtype=wp.int32),
+        near: wp.array(dtype=wp.int32),
+        touching: wp.array(dtype=wp.int32),
     ):
-        """Velocities of the particles after contact with obstacles, and whether they touch any."""
-        p = wp.tid()
-        v_p, stuck_p, touches_p = touch(
-            obstacles, distances, obstacle_row(c, p, pose), c.faces, c.dt, x[now, p], v[now, p], stuck[now, p],
-            radius[p],
-        )  # fmt: skip
-        v_now[p] = v_p
-        stuck[after, p] = stuck_p
-        touches[p] = touches_p
+        """Velocities of the particles after contact with obstacles.
+
+        Sets the particles that touch one, ``near[: touching[0]]``, in increasing order.
+        """
+        count = near_obstacles(
+            c, obstacles.shape[1] - c.faces, x[now], v[now], radius, v_now, stuck[after], near
+        )
+        found = wp.int32(0)
+        for q in range(count):
+            p = near[q]
+            v_p, stuck_p, touches = touch(
+                obstacles, distances, obstacle_row(c, p, pose), c.faces, c.dt, x[now, p], v[now, p], stuck[now, p],
+                radius[p],
+            )  # fmt: skip
+            if touches > 0:
+                v_now[p] = v_p
+                stuck[after, p] = stuck_p
+                near[found] = p
+                found += 1
+        touching[0] = found
 
     @kernel
     def p2g(
@@ -190,7 +214,7 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         if wp.static(special_nodes):
             lines = c.n * c.n
             for row in range(c.copies * lines):
-                span = (row / lines * 4 + 2) * lines + row % lines
+                span = (row / lines * 6 + 4) * lines + row % lines
                 for node in range(row * c.n + spans[span], row * c.n + spans[span + lines] + 1):
                     update_node(c, pose, node, grids[0], grids[1], holds, held_mass, held_by)
                     if wp.static(clamps):  # for the next step
@@ -307,7 +331,7 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         if wp.static(special_nodes):
             lines = c.n * c.n
             for row in range(c.copies * lines):
-                span = (row / lines * 4 + 2) * lines + row % lines
+                span = (row / lines * 6 + 4) * lines + row % lines
                 for node in range(row * c.n + spans[span], row * c.n + spans[span + lines] + 1):
                     node_adjoint(c, node, grids[0], grids[2])
         else:
@@ -352,22 +376,23 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         obstacles: wp.array2d(dtype=Obstacle),
         distances: wp.array(dtype=real),
         stuck: wp.array2d(dtype=vec3),
-        touches: wp.array(dtype=wp.int32),
+        near: wp.array(dtype=wp.int32),
+        touching: wp.array(dtype=wp.int32),
         grad_x: wp.array(dtype=vec3),
         grad_v: wp.array(dtype=vec3),
         grad_stuck: wp.array(dtype=vec3),
     ):
         """From gradients of velocity and displacement after contact to those of x (added), v and stuck (set)."""
-        p = wp.tid()
-        g_s = vec3()
-        if touches[p] > 0:
+        for q in range(touching[0]):
+            p = near[q]
             g_x, g_v, g_s = touch_adjoint(
                 obstacles, distances, obstacle_row(c, p, pose), c.faces, c.dt, x[now, p], v[now, p],
                 stuck[now, p], radius[p], grad_v[p], grad_stuck[p],
             )  # fmt: skip
             grad_x[p] = grad_x[p] + g_x
             grad_v[p] = g_v
-        grad_stuck[p] = g_s
+            grad_stuck[p] = g_s
+        clear_far(c, near, touching[0], grad_stuck)
 
     @wp.func_native(
         """

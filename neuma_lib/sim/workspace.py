@@ -118,7 +118,7 @@ class Workspace:
         if self.on_cpu:
             self.grids = self._buffer((2 + size.differentiable, nodes + _PADDING), "vec4")
             self.grid, self.grid_v, *_ = self.grids[:, None, :nodes]
-            self.spans = self._buffer((size.copies * 4 * size.model.nodes**2,), dtype=torch.int32)
+            self.spans = self._buffer((size.copies * 6 * size.model.nodes**2,), dtype=torch.int32)
         else:
             self.grid, self.grid_v = (
                 self._buffer((cached, nodes), "vec4"),
@@ -416,10 +416,10 @@ class Workspace:
         mass, vol0, radius = self.mass, self.vol0, self.radius
         if self.size.model.clamps:
             mass, vol0, radius = (self._buffer((N,), "real") for _ in range(3))
-        touching = N if self._contact else 1
+        near = N if self._contact else 1
         self._now = mass, vol0, radius
-        self._v_now = self._buffer((touching,), "vec3")
-        self._touches = self._buffer((touching,), dtype=torch.int32)
+        self._v_now = self._buffer((near,), "vec3")
+        self._near = self._buffer((near,), dtype=torch.int32), self._buffer((1,), dtype=torch.int32)
         self.to_grid = []
         if self.size.model.clamps:
             self.to_grid.append(self._repeated(
@@ -428,8 +428,8 @@ class Workspace:
             ))  # fmt: skip
         if self._contact:
             self.to_grid.append(self._repeated(
-                k.touch, N, self.x, self.v, radius, self.obstacles, self.distances, self.stuck,
-                self._v_now, self._touches,
+                k.touch, 1, self.x, self.v, radius, self.obstacles, self.distances, self.stuck,
+                self._v_now, *self._near,
             ))  # fmt: skip
         self.to_grid += [
             self._repeated(
@@ -493,8 +493,8 @@ class Workspace:
         ]  # fmt: skip
         if self._contact:
             launches.append(self._repeated(
-                k.touch_adjoint, N, self.x, self.v, radius, self.obstacles, self.distances, self.stuck,
-                self._touches, self.grad_x, self.grad_v, self.grad_stuck,
+                k.touch_adjoint, 1, self.x, self.v, radius, self.obstacles, self.distances, self.stuck,
+                *self._near, self.grad_x, self.grad_v, self.grad_stuck,
             ))  # fmt: skip
         return launches
 
