@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import cache
 
 import torch
 import warp as wp
@@ -54,7 +55,7 @@ class SegmentLoop:
         self._per_call = max(1, PARTICLE_STEPS // ws.size.particles)
         after = () if tracers is None else (tracers,)
         self._forward = LaunchSequence(
-            [*self._stresses(), *ws.to_grid, *ws.to_particles(self._elastic), *self._returns(), *after]
+            [*self._stresses(), *ws.to_grid, *ws.to_particles[self._elastic], *self._returns(), *after]
         )
         self._reverse: LaunchSequence | None = None
 
@@ -107,7 +108,7 @@ class SegmentLoop:
                 *before,
                 *ws.to_grid,
                 *(() if self._elastic else adjoints["plasticity"]),
-                *ws.adjoint(self._elastic),
+                *ws.adjoint[self._elastic],
                 *adjoints["elasticity"],
                 ws.add_elastic,
             ]
@@ -162,21 +163,26 @@ class SegmentLoop:
         """
         ws, rows = self._ws, self._rows[part, k]
         _, here, _ = self._parts[part][k]
-        labels = [arg.label for arg in kernel.adj.args]
+        labels = {arg.label: position for position, arg in enumerate(kernel.adj.args)}
         given = {"rows": rows.data_ptr(), "copies": len(rows), "n": (here.stop - here.start) // len(rows)}
         indices = {}
         for name, (value, at) in values.items():
             given[name] = (value if at is None else value[0])[here].data_ptr()
             if at is not None:
-                indices[labels.index(name)] = ws.index(at)._replace(base=given[name], stride=_stride(value))
+                indices[labels[name]] = ws.index(at)._replace(base=given[name], stride=_stride(value))
         if (part, k) in self._caches:
             by_step = {**by_step, "cache": self._caches[part, k]}
         for name, value in by_step.items():
             given[name] = value.data_ptr()
-            indices[labels.index(name)] = Index(0, len(value), given[name], _stride(value))
-        inputs = [given.get(label, 0) for label in labels]
-        launch = wp.launch(kernel, dim=1, inputs=inputs, device="cpu", block_dim=1, record_cmd=True)
-        return Repeated(launch, indices)
+            indices[labels[name]] = Index(0, len(value), given[name], _stride(value))
+        return Repeated(_launch(kernel), indices, {labels[name]: value for name, value in given.items()})
+
+
+@cache
+def _launch(kernel: wp.Kernel) -> wp.Launch:
+    """A recorded launch of a law's kernel, whose arguments are numbers."""
+    inputs = [0] * len(kernel.adj.args)
+    return wp.launch(kernel, dim=1, inputs=inputs, device="cpu", block_dim=1, record_cmd=True)
 
 
 _NOW, _AFTER, _CACHED = "now", "after", "cached"

@@ -7,7 +7,7 @@ any call of ctypes other Python threads run, but signals wait, so that calls hav
 
 # No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
 import ctypes
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import NamedTuple
 
@@ -34,53 +34,59 @@ class Index(NamedTuple):
     stride: int = 1
 
 
-class Repeated(NamedTuple):
-    """A recorded launch, and its arguments that depend on the step by their position."""
+class Repeated:
+    """A recorded launch, with arguments of its own.
 
-    launch: wp.Launch
-    indices: dict[int, Index]
+    Args:
+        launch: the launch, whose arguments are copied.
+        indices: arguments that depend on the step by position.
+        values: other arguments that differ from those of the launch by position.
+    """
+
+    def __init__(self, launch: wp.Launch, indices: Mapping[int, Index] = {}, values: Mapping[int, int] = {}):
+        bounds, *arguments = launch.params
+        kind, offsets = _structure(tuple(map(type, arguments)))
+        self.launch, self._arguments = launch, kind(*arguments)
+        for position, value in values.items():
+            setattr(self._arguments, f"a{position}", value)
+        start = ctypes.addressof(self._arguments)
+        function = ctypes.cast(launch.hooks.forward, ctypes.c_void_p).value
+        self.program = [function, ctypes.addressof(bounds), start, len(indices)]
+        for position, index in indices.items():
+            is_address = ctypes.sizeof(arguments[position]) >= 8  # also the first member of an array
+            self.program += [start + offsets[position], int(is_address), *index]
 
 
 class LaunchSequence:
     """Launches in the order of a step."""
 
     def __init__(self, launches: Sequence[Repeated]):
-        self._kept = []  # memory that the program refers to
-        program = [len(launches)]
-        for launch, indices in launches:
-            arguments, addresses = _arguments(launch)
-            self._kept += [launch, arguments]
-            function = ctypes.cast(launch.hooks.forward, ctypes.c_void_p).value
-            program += [
-                function,
-                ctypes.addressof(launch.params[0]),
-                ctypes.addressof(arguments),
-                len(indices),
-            ]
-            for position, index in indices.items():
-                is_address = (
-                    ctypes.sizeof(launch.params[position + 1]) >= 8
-                )  # also the first member of an array
-                program += [addresses[position], int(is_address), *index]
-        self._program = wp.array(np.array(program, dtype=np.int64), device="cpu")
-        inputs = [self._program, 0, 0, 0]
-        self._run = wp.launch(_repeat(), dim=1, inputs=inputs, device="cpu", record_cmd=True)
-        self._arguments, _ = _arguments(self._run)
-        self._call = [ctypes.byref(value) for value in (self._run.params[0], self._arguments)]
+        self._launches = tuple(launches)  # keeps their memory
+        numbers = [len(launches), *(number for launch in launches for number in launch.program)]
+        self._program = np.array(numbers, dtype=np.int64)
+        template = _repeat_launch()
+        kind, _ = _structure(tuple(map(type, template.params[1:])))
+        self._arguments = kind(self._program.ctypes.data)
+        self._function = template.hooks.forward
+        self._call = ctypes.byref(template.params[0]), ctypes.byref(self._arguments)
 
     def run(self, first: int, steps: int = 1, direction: int = 1) -> None:
         """Run steps ``first``, ``first + direction`` and so on."""
         self._arguments.a1, self._arguments.a2, self._arguments.a3 = first, steps, direction
-        self._run.hooks.forward(*self._call)
+        self._function(*self._call)
 
 
-def _arguments(launch: wp.Launch) -> tuple[ctypes.Structure, list[int]]:
-    """The structure that a launch passes to its function, and the addresses of its members."""
-    values = launch.params[1:]
-    fields = [(f"a{i}", type(value)) for i, value in enumerate(values)]
-    kind = type("Arguments", (ctypes.Structure,), {"_fields_": fields})
-    result = kind(*values)
-    return result, [ctypes.addressof(result) + getattr(kind, name).offset for name, _ in fields]
+@cache
+def _structure(types: tuple[type, ...]) -> tuple[type[ctypes.Structure], list[int]]:
+    """The structure of arguments of some types in which a launch passes them, and the offsets of its members."""
+    fields = [(f"a{i}", kind) for i, kind in enumerate(types)]
+    result = type("Arguments", (ctypes.Structure,), {"_fields_": fields})
+    return result, [getattr(result, name).offset for name, _ in fields]
+
+
+@cache
+def _repeat_launch() -> wp.Launch:
+    return wp.launch(_repeat(), dim=1, inputs=[0, 0, 0, 0], device="cpu", record_cmd=True)
 
 
 @cache
@@ -89,7 +95,7 @@ def _repeat() -> wp.Kernel:
 
     @wp.func_native("""
     typedef void (*Function)(void*, void*);
-    const int64_t* const start = (const int64_t*)program.data;
+    const int64_t* const start = (const int64_t*)program;
     for (int s = 0, n = first; s < steps; ++s, n += direction) {
         const int64_t* next = start + 1;
         for (int64_t k = 0; k < start[0]; ++k) {
@@ -106,10 +112,10 @@ def _repeat() -> wp.Kernel:
         }
     }
     """)
-    def repeat_native(program: wp.array(dtype=wp.int64), first: int, steps: int, direction: int): ...
+    def repeat_native(program: wp.uint64, first: int, steps: int, direction: int): ...
 
     @wp.kernel(enable_backward=False, module="neuma_lib.sim.sequence")
-    def repeat(program: wp.array(dtype=wp.int64), first: int, steps: int, direction: int):
+    def repeat(program: wp.uint64, first: int, steps: int, direction: int):
         repeat_native(program, first, steps, direction)
 
     return repeat

@@ -420,7 +420,7 @@ class _Tracers:
         self._ws, self._frame_of = ws, {n: index for index, n in enumerate(frames)}
         self._x = tracers.detach().clone(memory_format=torch.contiguous_format)
         self._launch = ws.tracer_launch(self._x)
-        self.repeated = Repeated(self._launch, {})
+        self.repeated = Repeated(self._launch)
         self.seen = self._x.new_empty(len(frames), *self._x.shape)
         self.store(0)
 

@@ -191,8 +191,8 @@ class Workspace:
         self.mass.copy_(mass)
         self.vol0.copy_(vol0)
         self.radius.copy_(contact_radius(vol0))
-        self.frictions = frictions
-        if self.size.n_poses == 1:
+        changed, self.frictions = not np.array_equal(frictions, self.frictions), frictions
+        if changed and self.size.n_poses == 1:
             self._load_obstacles([0.0])
 
     def pose_at(self, step: int) -> int:
@@ -440,13 +440,14 @@ class Workspace:
             ),
         ]
         self.to_trial = [self._repeated(k.trial_deformation, 1, self.C, self.F, self.F_trial)]
+        self.to_particles = {elastic: self._particle_launches(elastic) for elastic in (False, True)}
         self._steps = {
             "to_grid": LaunchSequence(self.to_grid),
-            "to_particles": LaunchSequence(self.to_particles()),
+            "to_particles": LaunchSequence(self.to_particles[False]),
             "to_trial": LaunchSequence(self.to_trial),
         }
 
-    def to_particles(self, elastic: bool = False) -> list[Repeated]:
+    def _particle_launches(self, elastic: bool) -> list[Repeated]:
         """Launches from velocities of the nodes to the state after a step, whose F is F_trial if ``elastic``."""
         k, N = transfer_kernels(self.size.dtype, self._features), self.size.particles
         mass, _, _ = self._now
@@ -466,7 +467,7 @@ class Workspace:
             launches.append(self._repeated(k.trial_deformation, 1, *total, cached="after"))
         return launches
 
-    def adjoint(self, elastic: bool = False) -> list[Repeated]:
+    def _adjoint_launches(self, elastic: bool) -> list[Repeated]:
         """Launches of `transfer_adjoint`. If ``elastic``, the gradient of F_trial is that of F after the step."""
         k, N = transfer_kernels(self.size.dtype, self._features), self.size.particles
         mass, vol0, radius = self._now
@@ -501,7 +502,8 @@ class Workspace:
     def _record_adjoint_on_cpu(self) -> None:
         k = transfer_kernels(self.size.dtype, self._features)
         self.add_elastic = self._repeated(k.add, 1, self.grad_F_elastic, self.grad_F)
-        self._steps["adjoint"] = LaunchSequence(self.adjoint())
+        self.adjoint = {elastic: self._adjoint_launches(elastic) for elastic in (False, True)}
+        self._steps["adjoint"] = LaunchSequence(self.adjoint[False])
 
     def _record_forward(self) -> None:
         k = forward_kernels(self.size.dtype, self.size.scatter, self._features)
