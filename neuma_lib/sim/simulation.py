@@ -108,7 +108,7 @@ class Simulation:
         self._weight_slices = weight_slices
         laws = [getattr(region.law, part) for region in regions for part in PARTS]
         self._uses_graphs = x.device.type == "cuda" and all(law.capturable for law in laws)
-        self._loops = x.device.type == "cpu" and all(law.native_rows for law in laws)
+        self._loops = self.workspace.on_cpu and all(law.native_rows for law in laws)
         self._loop: SegmentLoop | None = None
         self.errors: list[NonFiniteError | None] = [None] * copies
         self._graph_key = tuple((b.start, b.stop) for b in regions), tuple(law.graph_key() for law in laws)
@@ -385,6 +385,8 @@ class Simulation:
                 particle = int((~torch.isfinite(own).flatten(1).all(dim=1)).nonzero()[0])
                 flags[0] = (self.steps - 1) << 31 | copy * len(own) + particle
             self.errors.append(self._error(*flags))
+        if any(self.errors):
+            self.workspace.clear_grids()
         if all(self.errors):
             raise self.errors[0]
 

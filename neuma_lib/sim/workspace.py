@@ -378,8 +378,14 @@ class Workspace:
         }
         return Repeated(self._record(kernel, dim, *(0 for _ in numbers), *args), numbers)
 
+    def clear_grids(self) -> None:
+        """Clear nodes that are not numbers, which may be outside the spans, after a simulation that diverged."""
+        if self.on_cpu:
+            self.grids.zero_()
+
     @property
     def on_cpu(self) -> bool:
+        """Whether the kernels are those of `transfers`."""
         return self.size.device.type == "cpu"
 
     @property
@@ -462,6 +468,8 @@ class Workspace:
                 k.move_held, N, self.x, self.v, self.C, self.F, trial[0], self.holds, self.clamp, self.faults,
                 **trial[1],
             ))  # fmt: skip
+            # with the bytes that a recomputation has
+            launches.append(self._repeated(k.trial_deformation, 1, self.C, self.F, trial[0], **trial[1]))
         if self.size.total:
             total = self.C, self.F_total, self.F_total
             launches.append(self._repeated(k.trial_deformation, 1, *total, cached="after"))
