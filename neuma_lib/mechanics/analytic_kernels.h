@@ -2,12 +2,14 @@
 //
 // In another kernel: insert `analytic_kernels.laws(dtype)` at the start of the body of a native function and the part
 // "end" of singular_values_kernels.h at its end. This defines the types `Real` and `Pack` (one number for each of WIDTH
-// particles) and four lambdas of packs of row-major 3x3 matrices, without reference to arrays:
+// particles) and lambdas of packs of row-major 3x3 matrices, without reference to arrays:
 //
-//     stress(c, F, tau)                       F[9] -> tau[9]
-//     return_map(c, F_trial, F)               F_trial[9] -> F[9], which may be the same memory
-//     stress_vjp(c, F, g, grad_F, grad_c)     adjoint for the gradient g[9] of tau
+//     stress(c, F, tau)                         F[9] -> tau[9]
+//     return_map(c, F_trial, F)                 F_trial[9] -> F[9]
+//     flow(c, ce, F_trial, F, tau)              both at once
+//     stress_vjp(c, F, g, grad_F, grad_c)       adjoint for the gradient g[9] of tau
 //     return_vjp(c, F_trial, g, grad_F, grad_c)
+//     flow_vjp(c, ce, F_trial, F, g, g_tau, grad_F, grad_c, grad_ce)
 //
 // `c` points to the row of `analytic_kernels.row`: the index of the law and its coefficients c[1], c[2], ... A vjp sets
 // grad_F[9] and grad_c[COEFFICIENTS], per particle: grad_c[k] is the gradient of c[k + 1]. Particles of a pack share c.
@@ -262,46 +264,12 @@
         slope = c[3] * growth * (bounded ? one : one + exponent + exponent);
         return bounded;
     };
-    auto stress = [&](const Real* c, const Pack* F, Pack* tau, Pack* kept = nullptr) {
-        const int law = (int)c[0];
-        if (is_tensor_law(law)) {
-            tensor_stress(c, F, tau);
-            return;
-        }
-        Pack u[3][3], v[3][3], s[3], y[3];
-        const Pack gy[3] = {zero, zero, zero};
-        decompose(F, u, v, s, kept, false);
-        principal_stress(c, s, false, gy, y, y, y, y);
-        Pack along[3], strain, growth, tension = zero, slope;
-        if (law == FibreReinforced) fibre(c, F, along, strain, growth, tension, slope);
-        for (int i = 0; i < 3; ++i)
-            for (int j = 0; j <= i; ++j) {
-                Pack value = u[0][i] * y[0] * u[0][j] + u[1][i] * y[1] * u[1][j] + u[2][i] * y[2] * u[2][j];
-                if (law == FibreReinforced) value = value + tension * along[i] * along[j];
-                tau[3 * i + j] = tau[3 * j + i] = value;
-            }
+    auto add_fibres = [&](const Real* c, const Pack* F, Pack* tau) {
+        Pack along[3], strain, growth, tension, slope;
+        fibre(c, F, along, strain, growth, tension, slope);
+        for (int k = 0; k < 9; ++k) tau[k] = tau[k] + tension * along[k / 3] * along[k % 3];
     };
-    auto stress_vjp = [&](const Real* c, const Pack* F, const Pack* g, Pack* grad_F, Pack* grad_c, Pack* kept = nullptr) {
-        const int law = (int)c[0];
-        no_gradient(grad_c);
-        if (is_tensor_law(law)) {
-            tensor_stress_vjp(c, F, g, grad_F, grad_c);
-            return;
-        }
-        Pack u[3][3], v[3][3], s[3], y[3], quotient[3], gs[3], G[3][3], K[3][3];
-        decompose(F, u, v, s, kept, true);
-        turn(u, g, u, G);
-        const Pack gy[3] = {G[0][0], G[1][1], G[2][2]};
-        principal_stress(c, s, true, gy, y, quotient, gs, grad_c);
-        for (int k = 0; k < 3; ++k) {
-            const int i = FIRST[k], j = SECOND[k];
-            const Pack both = quotient[k] * (G[i][j] + G[j][i]) / away_from_zero(s[i] + s[j]);
-            K[k][k] = gs[k];
-            K[i][j] = both * s[j];
-            K[j][i] = both * s[i];
-        }
-        turn_back(u, K, v, grad_F);
-        if (law != FibreReinforced) return;
+    auto add_fibres_vjp = [&](const Real* c, const Pack* F, const Pack* g, Pack* grad_F, Pack* grad_c) {
         Pack along[3], strain, growth, tension, slope, pulled[3], grad_along[3];
         const auto bounded = fibre(c, F, along, strain, growth, tension, slope);
         for (int i = 0; i < 3; ++i) pulled[i] = dot(g + 3 * i, along);
@@ -316,6 +284,55 @@
         }
         grad_c[2] = work * strain * growth;
         grad_c[3] = bounded ? zero : work * tension * strain * strain;
+    };
+    // U diag(y) U^T for the principal stresses y of stretches s
+    auto coaxial_stress = [&](const Real* c, const Pack (*u)[3], const Pack* s, Pack* tau) {
+        Pack y[3];
+        const Pack gy[3] = {zero, zero, zero};
+        principal_stress(c, s, false, gy, y, y, y, y);
+        for (int i = 0; i < 3; ++i)
+            for (int j = 0; j <= i; ++j)
+                tau[3 * i + j] = tau[3 * j + i]
+                    = u[0][i] * y[0] * u[0][j] + u[1][i] * y[1] * u[1][j] + u[2][i] * y[2] * u[2][j];
+    };
+    // K of its gradient U K V^T
+    auto coaxial_stress_vjp = [&](const Real* c, const Pack (*u)[3], const Pack* s, const Pack* g, Pack (*K)[3],
+                                  Pack* grad_c) {
+        Pack y[3], quotient[3], gs[3], G[3][3];
+        turn(u, g, u, G);
+        const Pack gy[3] = {G[0][0], G[1][1], G[2][2]};
+        principal_stress(c, s, true, gy, y, quotient, gs, grad_c);
+        for (int k = 0; k < 3; ++k) {
+            const int i = FIRST[k], j = SECOND[k];
+            const Pack both = quotient[k] * (G[i][j] + G[j][i]) / away_from_zero(s[i] + s[j]);
+            K[k][k] = gs[k];
+            K[i][j] = both * s[j];
+            K[j][i] = both * s[i];
+        }
+    };
+    auto stress = [&](const Real* c, const Pack* F, Pack* tau, Pack* kept = nullptr) {
+        const int law = (int)c[0];
+        if (is_tensor_law(law)) {
+            tensor_stress(c, F, tau);
+            return;
+        }
+        Pack u[3][3], v[3][3], s[3];
+        decompose(F, u, v, s, kept, false);
+        coaxial_stress(c, u, s, tau);
+        if (law == FibreReinforced) add_fibres(c, F, tau);
+    };
+    auto stress_vjp = [&](const Real* c, const Pack* F, const Pack* g, Pack* grad_F, Pack* grad_c, Pack* kept = nullptr) {
+        const int law = (int)c[0];
+        no_gradient(grad_c);
+        if (is_tensor_law(law)) {
+            tensor_stress_vjp(c, F, g, grad_F, grad_c);
+            return;
+        }
+        Pack u[3][3], v[3][3], s[3], K[3][3];
+        decompose(F, u, v, s, kept, true);
+        coaxial_stress_vjp(c, u, s, g, K, grad_c);
+        turn_back(u, K, v, grad_F);
+        if (law == FibreReinforced) add_fibres_vjp(c, F, g, grad_F, grad_c);
     };
 
 // Principal stretches y = exp(a + b dev) after the return, and whether there is one. Returns false without y if no
@@ -456,30 +473,26 @@
         for (int k = 0; k < 5; ++k) grad_c[k] = yields ? ga * a_c[k] + gb * b_c[k] : zero;
         return true;
     };
-    auto return_map = [&](const Real* c, const Pack* F, Pack* out, Pack* kept = nullptr) {
-        Pack u[3][3], v[3][3], s[3], y[3];
-        Mask yields;
-        for (int k = 0; k < 9; ++k) out[k] = F[k];
-        if ((int)c[0] == Identity) return;
-        decompose(F, u, v, s, kept, false);
+    // F = U diag(y) V^T where y differs from s, else F_trial; sets s to y
+    auto coaxial_return = [&](const Real* c, const Pack (*u)[3], const Pack (*v)[3], Pack* s, const Pack* F_trial, Pack* F) {
         const Pack gy[3] = {zero, zero, zero};
+        Pack y[3], value[9];
+        Mask yields;
+        for (int k = 0; k < 9; ++k) F[k] = F_trial[k];
         if (!principal_return(c, s, false, gy, y, yields, y, y, y)) return;
         yields = yields & ((y[0] != s[0]) | (y[1] != s[1]) | (y[2] != s[2]));
-        for (int i = 0; i < 3; ++i)
-            for (int j = 0; j < 3; ++j) {
-                const Pack value = u[0][i] * y[0] * v[0][j] + u[1][i] * y[1] * v[1][j] + u[2][i] * y[2] * v[2][j];
-                out[3 * i + j] = yields ? value : out[3 * i + j];
-            }
+        const Pack K[3][3] = {{y[0], zero, zero}, {zero, y[1], zero}, {zero, zero, y[2]}};
+        turn_back(u, K, v, value);
+        for (int k = 0; k < 9; ++k) F[k] = yields ? value[k] : F[k];
+        for (int k = 0; k < 3; ++k) s[k] = yields ? y[k] : s[k];
     };
-    auto return_vjp = [&](const Real* c, const Pack* F, const Pack* g, Pack* grad_F, Pack* grad_c, Pack* kept = nullptr) {
-        Pack u[3][3], v[3][3], s[3], y[3], quotient[3], gs[3], G[3][3], K[3][3], back[9];
+    // From G = U^T g V, the gradient g of F. Where nothing yields, the gradient is g.
+    auto coaxial_return_vjp = [&](const Real* c, const Pack (*u)[3], const Pack (*v)[3], const Pack* s,
+                                  const Pack (*G)[3], const Pack* g, Pack* grad_F, Pack* grad_c) {
+        Pack y[3], quotient[3], gs[3], K[3][3], value[9];
         Mask yields;
-        no_gradient(grad_c);
-        for (int k = 0; k < 9; ++k) grad_F[k] = g[k];
-        if ((int)c[0] == Identity) return;
-        decompose(F, u, v, s, kept, true);
-        turn(u, g, v, G);
         const Pack gy[3] = {G[0][0], G[1][1], G[2][2]};
+        for (int k = 0; k < 9; ++k) grad_F[k] = g[k];
         if (!principal_return(c, s, true, gy, y, yields, quotient, gs, grad_c)) return;
         for (int k = 0; k < 3; ++k) {
             const int i = FIRST[k], j = SECOND[k];
@@ -489,8 +502,67 @@
             K[i][j] = stretch + spin;
             K[j][i] = stretch - spin;
         }
-        turn_back(u, K, v, back);
-        for (int k = 0; k < 9; ++k) grad_F[k] = yields ? back[k] : grad_F[k];
+        turn_back(u, K, v, value);
+        for (int k = 0; k < 9; ++k) grad_F[k] = yields ? value[k] : grad_F[k];
+    };
+    auto return_map = [&](const Real* c, const Pack* F_trial, Pack* F, Pack* kept = nullptr) {
+        if ((int)c[0] == Identity) {
+            for (int k = 0; k < 9; ++k) F[k] = F_trial[k];
+            return;
+        }
+        Pack u[3][3], v[3][3], s[3];
+        decompose(F_trial, u, v, s, kept, false);
+        coaxial_return(c, u, v, s, F_trial, F);
+    };
+    auto return_vjp = [&](const Real* c, const Pack* F_trial, const Pack* g, Pack* grad_F, Pack* grad_c, Pack* kept = nullptr) {
+        no_gradient(grad_c);
+        if ((int)c[0] == Identity) {
+            for (int k = 0; k < 9; ++k) grad_F[k] = g[k];
+            return;
+        }
+        Pack u[3][3], v[3][3], s[3], G[3][3];
+        decompose(F_trial, u, v, s, kept, true);
+        turn(u, g, v, G);
+        coaxial_return_vjp(c, u, v, s, G, g, grad_F, grad_c);
+    };
+
+// Return map and the stress after it, with one decomposition instead of two: the return keeps U and V. Coefficients c of
+// the plasticity and ce of the elasticity.
+//// flow
+    auto flow = [&](const Real* c, const Real* ce, const Pack* F_trial, Pack* F, Pack* tau, Pack* kept = nullptr) {
+        if ((int)c[0] == Identity || is_tensor_law((int)ce[0])) {
+            return_map(c, F_trial, F, kept);
+            stress(ce, F, tau, (int)c[0] == Identity ? kept : nullptr);
+            return;
+        }
+        Pack u[3][3], v[3][3], s[3];
+        decompose(F_trial, u, v, s, kept, false);
+        coaxial_return(c, u, v, s, F_trial, F);
+        coaxial_stress(ce, u, s, tau);
+        if ((int)ce[0] == FibreReinforced) add_fibres(ce, F, tau);
+    };
+    // For gradients g of F, without the part through tau, and g_tau; F is the result of the return
+    auto flow_vjp = [&](const Real* c, const Real* ce, const Pack* F_trial, const Pack* F, const Pack* g,
+                        const Pack* g_tau, Pack* grad_F, Pack* grad_c, Pack* grad_ce, Pack* kept = nullptr) {
+        Pack all[9];
+        if ((int)c[0] == Identity || is_tensor_law((int)ce[0])) {
+            stress_vjp(ce, F, g_tau, all, grad_ce, (int)c[0] == Identity ? kept : nullptr);
+            for (int k = 0; k < 9; ++k) all[k] = all[k] + g[k];
+            return_vjp(c, F_trial, all, grad_F, grad_c, kept);
+            return;
+        }
+        Pack u[3][3], v[3][3], s[3], y[3], unused[9], K[3][3], G[3][3];
+        no_gradient(grad_c);
+        no_gradient(grad_ce);
+        decompose(F_trial, u, v, s, kept, true);
+        for (int k = 0; k < 3; ++k) y[k] = s[k];
+        coaxial_return(c, u, v, y, F_trial, unused);
+        coaxial_stress_vjp(ce, u, y, g_tau, K, grad_ce);
+        turn_back(u, K, v, all);
+        if ((int)ce[0] == FibreReinforced) add_fibres_vjp(ce, F, g_tau, all, grad_ce);
+        for (int k = 0; k < 9; ++k) all[k] = all[k] + g[k];
+        turn(u, all, v, G);
+        coaxial_return_vjp(c, u, v, s, G, all, grad_F, grad_c);
     };
 
 // Kernels of analytic_kernels.py: consecutive copies of n rows, each with a row of coefficients. On a GPU a thread

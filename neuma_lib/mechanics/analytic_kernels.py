@@ -72,14 +72,15 @@ def row(law: str, coefficients: tuple[Tensor | float, ...]) -> Tensor:
 
 
 def laws(dtype: torch.dtype) -> str:
-    """C++ source that defines `stress`, `return_map` and their adjoints, see ``analytic_kernels.h``."""
+    """C++ source that defines `stress`, `return_map`, `flow` and their adjoints, see ``analytic_kernels.h``."""
     parts = native_source(__file__, ".h")
     constants = (
         f"    enum {{ {', '.join(LAWS)} }};\n    const int COEFFICIENTS = {COEFFICIENTS}, KEPT = {KEPT};\n"
     )
     for name, value in (("STRETCH_MIN", STRETCH_MIN), ("FIBRE_EXPONENT_MAX", FIBRE_EXPONENT_MAX)):
         constants += f"    const Real {name} = Real({value!r});\n"
-    text = FUSE + TYPES + constants + MATH + parts["functions"] + parts["elasticity"] + parts["plasticity"]
+    text = FUSE + TYPES + constants + MATH
+    text += "".join(parts[name] for name in ("functions", "elasticity", "plasticity", "flow"))
     return filled(text.replace("{ROUND_ALL}", ROUND_ALL).replace("{SVD}", SVD), dtype)
 
 

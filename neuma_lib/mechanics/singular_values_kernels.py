@@ -1,8 +1,8 @@
 """Kernels of `singular_values`: the SVD of 3x3 matrices for CPU lanes and CUDA threads.
 
 An SVD is a long sequence of dependent square roots and divisions, which leaves the vector units of a CPU idle if it
-processes one matrix at a time. ``singular_values_kernels.h`` processes a *pack*: 8 or 16 matrices, one per SIMD lane, on
-a CPU (6 times faster), and one matrix per thread on a GPU. It is C++ because Warp's Python functions have no lanes.
+processes one matrix at a time. ``singular_values_kernels.h`` processes a *pack*: 8 or 16 matrices, one per SIMD lane,
+on a CPU (6 times faster), and one matrix per thread on a GPU. It is C++ because Warp's Python functions have no lanes.
 :func:`snippet` composes a kernel of these parts.
 """
 
