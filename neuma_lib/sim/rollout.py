@@ -20,6 +20,7 @@ from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.free_flight import ballistic, free_flight_steps
 from neuma_lib.sim.memory import DEFAULT_CACHE_BYTES, plan_memory
 from neuma_lib.sim.model import MPM, MaterialRegion, as_regions
+from neuma_lib.sim.scatter import scatter_for
 from neuma_lib.sim.simulation import Simulation, gather_weights
 from neuma_lib.sim.state import State, Trajectory
 
@@ -180,14 +181,14 @@ def fly_and_simulate(
         start = (landed.x[0], landed.v[0], *start[2:])
         tracers = None if landed.tracers is None else landed.tracers[0]
     x, steps, plan = state.x, frames[-1] - first, None
+    scatter = scatter or scatter_for(x.device, x.dtype)
     weights, slices = gather_weights(regions, x.dtype)
     inputs = (*start, *weights)
     if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
         cache_bytes = DEFAULT_CACHE_BYTES[x.device.type] if cache_bytes is None else cache_bytes
         nodes, contact = copies * model.nodes**3, model.contact == "particles"
-        keeps_grids = x.device.type != "cpu"
         plan = plan_memory(
-            steps, len(x), nodes, x.element_size(), cache_bytes, memory, total, contact, keeps_grids
+            steps, len(x), nodes, x.element_size(), cache_bytes, memory, total, contact, scatter != "native"
         )
     simulation = Simulation(
         model, regions, slices, state, steps, first, plan, scatter, total, copies, frictions

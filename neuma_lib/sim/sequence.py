@@ -35,7 +35,7 @@ class Index(NamedTuple):
 
 
 class Repeated:
-    """A recorded launch, with arguments of its own.
+    """A recorded launch with its own copy of the arguments.
 
     Args:
         launch: the launch, whose arguments are copied.

@@ -108,7 +108,7 @@ class Simulation:
         self._weight_slices = weight_slices
         laws = [getattr(region.law, part) for region in regions for part in PARTS]
         self._uses_graphs = x.device.type == "cuda" and all(law.capturable for law in laws)
-        self._loops = self.workspace.on_cpu and all(law.native_rows for law in laws)
+        self._loops = self.workspace.native and all(law.native_rows for law in laws)
         self._loop: SegmentLoop | None = None
         self.errors: list[NonFiniteError | None] = [None] * copies
         self._graph_key = tuple((b.start, b.stop) for b in regions), tuple(law.graph_key() for law in laws)
@@ -219,7 +219,7 @@ class Simulation:
         if not self.plan.caches_steps:
             self._evaluate("elasticity", n, F, weights, ws.tau[cached], fill_cache=True)
             ws.trial_deformation(n)
-        if not self.plan.caches_steps or ws.on_cpu:
+        if not self.plan.caches_steps or ws.native:
             ws.transfer_to_grid(n)
         self._vjp("plasticity", n, F_trial, weights, ws.grad_F, ws.grad_F_trial, sums)
         ws.transfer_adjoint(n)
@@ -283,7 +283,7 @@ class Simulation:
         ws = self.workspace
         totals = ws.grad_states
         frame_of = {n: index for index, n in enumerate(at)}
-        if not ws.on_cpu:
+        if not ws.native:
             ws.grad_grid.zero_()
         with ws.stream():
             sums = {

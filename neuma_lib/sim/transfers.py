@@ -165,7 +165,7 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         count = near_obstacles(
             c, obstacles.shape[1] - c.faces, x[now], v[now], radius, v_now, stuck[after], near
         )
-        found = wp.int32(0)
+        number = wp.int32(0)
         for q in range(count):
             p = near[q]
             v_p, stuck_p, touches = touch(
@@ -175,9 +175,9 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
             if touches > 0:
                 v_now[p] = v_p
                 stuck[after, p] = stuck_p
-                near[found] = p
-                found += 1
-        touching[0] = found
+                near[number] = p
+                number += 1
+        touching[0] = number
 
     @kernel
     def p2g(

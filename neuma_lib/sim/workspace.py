@@ -115,7 +115,7 @@ class Workspace:
         if self._contact:
             self.states += (self.stuck,)
         self.tau, self.F_trial = self._buffer((cached, N), "mat33"), self._buffer((cached, N), "mat33")
-        if self.on_cpu:
+        if self.native:
             self.grids = self._buffer((2 + size.differentiable, nodes + _PADDING), "vec4")
             self.grid, self.grid_v, *_ = self.grids[:, None, :nodes]
             self.spans = self._buffer((size.copies * 6 * size.model.nodes**2,), dtype=torch.int32)
@@ -140,14 +140,14 @@ class Workspace:
         self.checkpoints = tuple(
             value.new_empty(size.n_checkpoints, *value.shape[1:]) for value in self.states
         )
-        self.sorts = size.scatter != "atomic"
+        self.sorts = size.scatter not in ("native", "atomic")
         n_sorts = -(-max(states - 1, 1) // SORT_EVERY) if self.sorts and size.differentiable else 1
         self.order = self._buffer((n_sorts, N if self.sorts else 1), dtype=torch.int32)
         self.cells = self._buffer((N if self.sorts else 1,), dtype=torch.int32)
         self._constants = _grid_constants(size)
         self._deformation = deformation_kernels(size.dtype)
-        if self.on_cpu:
-            self._record_forward_on_cpu()
+        if self.native:
+            self._record_native()
         else:
             self._record_forward()
         if size.differentiable:
@@ -162,8 +162,8 @@ class Workspace:
             self.grad_stuck = self._buffer((N if self._contact else 1,), "vec3")
             if self._contact:
                 self.grad_states += (self.grad_stuck,)
-            if self.on_cpu:
-                self._record_adjoint_on_cpu()
+            if self.native:
+                self._record_native_adjoint()
             else:
                 self.grad_grid = self._buffer((2, nodes), "vec4")
                 self._record_adjoint()
@@ -264,7 +264,7 @@ class Workspace:
 
     def transfer_to_grid(self, step: int) -> None:
         """From tau and the state of a step to the velocities of the nodes."""
-        if self.on_cpu:
+        if self.native:
             self._steps["to_grid"].run(step)
             return
         cached = self.cached_at(step)
@@ -277,7 +277,7 @@ class Workspace:
 
     def transfer_to_particles(self, step: int) -> None:
         """From velocities of the nodes to x, v, C and the total deformation after the step, and to F_trial."""
-        if self.on_cpu:
+        if self.native:
             self._steps["to_particles"].run(step)
             return
         now, after = self.at(step), self.at(step + 1)
@@ -287,7 +287,7 @@ class Workspace:
 
     def trial_deformation(self, step: int) -> None:
         """Recompute F_trial of a step from the F before and the C after it."""
-        if self.on_cpu:
+        if self.native:
             self._steps["to_trial"].run(step)
             return
         _run(self._trial, self.at(step), self.at(step + 1), self.cached_at(step))
@@ -301,7 +301,7 @@ class Workspace:
 
     def move_tracers(self, launch: wp.Launch, step: int) -> None:
         """Advect tracers by the node velocities of a step."""
-        _run(launch, 0 if self.on_cpu else self.cached_at(step))
+        _run(launch, 0 if self.native else self.cached_at(step))
 
     def transfer_adjoint(self, step: int) -> None:
         """From gradients of the state after a step and of F_trial to those of the state before it and of tau.
@@ -309,7 +309,7 @@ class Workspace:
         grad_x, grad_v, grad_C and grad_F_total are updated in place, and grad_F is set to the contribution of F_trial.
         Call it for decreasing steps after clearing `grad_grid` once.
         """
-        if self.on_cpu:
+        if self.native:
             self._steps["adjoint"].run(step)
             return
         now, after, cached = self.at(step), self.at(step + 1), self.cached_at(step)
@@ -380,13 +380,13 @@ class Workspace:
 
     def clear_grids(self) -> None:
         """Clear nodes that are not numbers, which may be outside the spans, after a simulation that diverged."""
-        if self.on_cpu:
+        if self.native:
             self.grids.zero_()
 
     @property
-    def on_cpu(self) -> bool:
+    def native(self) -> bool:
         """Whether the kernels are those of `transfers`."""
-        return self.size.device.type == "cpu"
+        return self.size.scatter == "native"
 
     @property
     def _contact(self) -> bool:
@@ -401,7 +401,7 @@ class Workspace:
             "contact": self._contact,
             "meshes": meshes,
             "clamps": bool(self.size.model.clamps),
-            "walls": self.on_cpu and self.size.model.wall_nodes > 0,
+            "walls": self.native and self.size.model.wall_nodes > 0,
         }
         return tuple(name for name, value in has.items() if value)
 
@@ -416,7 +416,7 @@ class Workspace:
         N = self.size.particles
         return -(-N // BLOCK) * BLOCK if self.sorts else N
 
-    def _record_forward_on_cpu(self) -> None:
+    def _record_native(self) -> None:
         k, N = transfer_kernels(self.size.dtype, self._features), self.size.particles
         held = self.holds, self.clamp
         mass, vol0, radius = self.mass, self.vol0, self.radius
@@ -507,7 +507,7 @@ class Workspace:
             ))  # fmt: skip
         return launches
 
-    def _record_adjoint_on_cpu(self) -> None:
+    def _record_native_adjoint(self) -> None:
         k = transfer_kernels(self.size.dtype, self._features)
         self.add_elastic = self._repeated(k.add, 1, self.grad_F_elastic, self.grad_F)
         self.adjoint = {elastic: self._adjoint_launches(elastic) for elastic in (False, True)}

@@ -1,4 +1,4 @@
-"""Transfers on a CPU and loops over a segment, against the kernels of other devices and Python's loop over the steps."""
+"""Transfers on a CPU and loops over a segment, against the kernels of other devices and a loop in Python."""
 
 import math
 import os
@@ -12,14 +12,13 @@ import pytest
 import torch
 
 from neuma_lib.errors import NonFiniteError
-from neuma_lib.sim import segment_loop
+from neuma_lib.sim import segment_loop, workspace
 from neuma_lib.sim.batch import rollout_batch
 from neuma_lib.sim.clamps import Clamp
 from neuma_lib.sim.model import MPM, MaterialRegion
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.simulation import Simulation
 from neuma_lib.sim.state import State
-from neuma_lib.sim.workspace import Workspace, free_pool
 from tests.support.contact_scenes import COLLIDERS
 from tests.support.sim_scenes import DT, SPECS, cube, make_law, strained
 
@@ -68,19 +67,6 @@ def run(model, law, start, frames, **options):
     return [value.detach() for value in (*states, *tracers)], list(grads)
 
 
-@pytest.fixture
-def elsewhere(monkeypatch):
-    """A function that switches to the kernels of other devices."""
-    free_pool()
-
-    def switch():
-        free_pool()
-        monkeypatch.setattr(Workspace, "on_cpu", False)
-
-    yield switch
-    free_pool()
-
-
 def assert_near(values, expected, tolerance):
     for one, other in zip(values, expected, strict=True):
         assert (one - other).abs().max() <= tolerance * other.abs().max()
@@ -92,7 +78,7 @@ def assert_equal(values, expected):
 
 @pytest.mark.parametrize("name", ["neo_hookean", "von_mises", "neural"])
 @pytest.mark.parametrize("contact", MODELS)
-def test_equal_the_kernels_of_other_devices(contact, name, elsewhere):
+def test_equal_the_kernels_of_other_devices(contact, name):
     """With contact, clamps and tracers, one of which is far from the body, if steps are kept and if they are not."""
     model, law, start, frames = MODELS[contact], make_law(name), falling(contact), (0, 7, 25)
     tracers = torch.cat([start.x[:5] + 0.01, torch.full((1, 3), 0.9, dtype=torch.float64)])
@@ -100,8 +86,7 @@ def test_equal_the_kernels_of_other_devices(contact, name, elsewhere):
         run(model, law, start, frames, tracers=tracers, cache_bytes=cache_bytes)
         for cache_bytes in (0, math.inf)
     ]
-    elsewhere()
-    states, grads = run(model, law, start, frames, tracers=tracers)
+    states, grads = run(model, law, start, frames, tracers=tracers, scatter="atomic")
     for own_states, own_grads in native:
         assert_near(own_states, states, 1e-12)
         assert_near(own_grads, grads, 1e-10)
@@ -109,24 +94,23 @@ def test_equal_the_kernels_of_other_devices(contact, name, elsewhere):
 
 
 @pytest.mark.parametrize("name, tolerance", [("neo_hookean", 1e-5), ("von_mises", 5e-5)])
-def test_float32_over_200_steps_of_contact(name, tolerance, elsewhere):
+def test_float32_over_200_steps_of_contact(name, tolerance):
     """Positions to 1e-6 and gradients to 1e-5, or to less than the round-off of float32 where a body flows."""
 
-    def rolled(dtype):
+    def rolled(dtype, **options):
         x, mass, vol0 = cube(1000, 0.3, (0.5, 0.17, 0.5), dtype=dtype)
         v = torch.tensor([0.3, -0.5, 0.1], dtype=dtype).expand_as(x).contiguous()
-        return run(MPM(14, DT), make_law(name, dtype), State(x, v, mass, vol0), (200,))
+        return run(MPM(14, DT), make_law(name, dtype), State(x, v, mass, vol0), (200,), **options)
 
     (states, grads), (_, exact) = rolled(torch.float32), rolled(torch.float64)
-    elsewhere()
-    expected, expected_grads = rolled(torch.float32)
+    expected, expected_grads = rolled(torch.float32, scatter="atomic")
     assert_near(states[:1], expected[:1], 1e-6)
     assert_near(grads, expected_grads, tolerance)
     for own, other, best in zip(grads, expected_grads, exact, strict=True):
         assert (own - best).norm() < 1.5 * (other - best).norm()
 
 
-def test_scattered_debris(elsewhere):
+def test_scattered_debris():
     """Particles all over the grid, in no order, and at its ends."""
     model, law = MPM(20, DT, contact="nodes"), make_law("neo_hookean")
     low, high = model.stencil_range
@@ -136,8 +120,7 @@ def test_scattered_debris(elsewhere):
     _, mass, vol0 = cube(333)
     start = State(x, 0.1 * torch.randn(x.shape, generator=generator, dtype=torch.float64), mass, vol0)
     states, grads = run(model, law, start, (1, 3), skip_free_flight=False)
-    elsewhere()
-    expected, expected_grads = run(model, law, start, (1, 3), skip_free_flight=False)
+    expected, expected_grads = run(model, law, start, (1, 3), skip_free_flight=False, scatter="atomic")
     assert_near(states, expected, 1e-12)
     assert_near(grads, expected_grads, 1e-10)
 
@@ -147,12 +130,11 @@ def test_only_touched_nodes_are_not_zero():
     start, law = falling("particles", count=50), make_law("neo_hookean")
     lifted = replace(start, x=start.x + torch.tensor([0.0, 0.4, 0.3]).double())
     model = MODELS["particles"]
-    free_pool()
+    workspace.free_pool()
     paths = rollout_batch(
         model, [law, law], [start, lifted], steps=80, frames=(79, 80), skip_free_flight=False
     )
-    simulations = [w for w in _workspaces() if w.size.copies == 2]
-    (ws,) = simulations
+    (ws,) = workspace._pool
     nodes, expected = model.nodes, torch.zeros(2, *3 * [model.nodes], dtype=torch.bool)
     for copy, path in enumerate(paths):
         base = (path.x[0] / model.dx - model.first_node - 0.5).int()
@@ -160,12 +142,6 @@ def test_only_touched_nodes_are_not_zero():
             expected[copy][tuple((base + offset).T)] = True
     touched = (ws.grid_v[0] != 0).any(dim=1)
     assert torch.equal(touched.reshape(2, nodes, nodes, nodes), expected)
-
-
-def _workspaces():
-    from neuma_lib.sim import workspace
-
-    return workspace._pool
 
 
 @pytest.mark.parametrize("contact", ["obstacles", "clamps"])
@@ -191,7 +167,7 @@ def test_segments_equal_steps_of_python(contact, name, monkeypatch):
         assert_equal([*other[0], *other[1]], [*expected[0][0], *expected[0][1]])
 
 
-def test_faults_are_reported_with_step_and_particle(elsewhere):
+def test_faults_are_reported_with_step_and_particle():
     """As by the kernels of other devices. The next rollout in the same memory is not affected."""
     model, law, start = MPM(14, DT), make_law("neo_hookean"), falling("particles")
     good = run(model, law, start, (20,))
@@ -199,17 +175,16 @@ def test_faults_are_reported_with_step_and_particle(elsewhere):
     far[41] = torch.tensor([0.0, 0.0, 3000.0])
     bad = [replace(start, v=far), replace(start, F=start.F.index_fill(0, torch.tensor([17]), 1e200))]
 
-    def faults():
+    def faults(**options):
         for own in bad:
             with pytest.raises(NonFiniteError) as error:
-                run(model, law, own, (20,))
+                run(model, law, own, (20,), **options)
             yield error.value.step, error.value.particle, error.value.happened
 
-    found = list(faults())
+    reported = list(faults())
     again = run(model, law, start, (20,))
     assert_equal([*again[0], *again[1]], [*good[0], *good[1]])
-    elsewhere()
-    assert list(faults()) == found
+    assert list(faults(scatter="atomic")) == reported
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a timer")
