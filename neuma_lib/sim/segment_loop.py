@@ -55,7 +55,13 @@ class SegmentLoop:
         self._per_call = max(1, PARTICLE_STEPS // ws.size.particles)
         after = () if tracers is None else (tracers,)
         self._forward = LaunchSequence(
-            [*self._stresses(), *ws.to_grid, *ws.to_particles[self._elastic], *self._returns(), *after]
+            [
+                *self._stresses(),
+                *ws.native.to_grid,
+                *ws.native.to_particles[self._elastic],
+                *self._returns(),
+                *after,
+            ]
         )
         self._reverse: LaunchSequence | None = None
 
@@ -102,15 +108,17 @@ class SegmentLoop:
                     extra["partials"] = self._partials[part, k]
                 kernel = analytic_kernels.vjp_kernel(part, ws.size.dtype)
                 adjoints[part].append(self._launch(kernel, part, k, values, extra))
-        before = [] if self._caches_steps else [*self._stresses(), *(() if self._elastic else ws.to_trial)]
+        before = (
+            [] if self._caches_steps else [*self._stresses(), *(() if self._elastic else ws.native.to_trial)]
+        )
         return LaunchSequence(
             [
                 *before,
-                *ws.to_grid,
+                *ws.native.to_grid,
                 *(() if self._elastic else adjoints["plasticity"]),
-                *ws.adjoint[self._elastic],
+                *ws.native.adjoint[self._elastic],
                 *adjoints["elasticity"],
-                ws.add_elastic,
+                ws.native.add_elastic,
             ]
         )
 
@@ -169,7 +177,7 @@ class SegmentLoop:
         for name, (value, at) in values.items():
             given[name] = (value if at is None else value[0])[here].data_ptr()
             if at is not None:
-                indices[labels[name]] = ws.index(at)._replace(base=given[name], stride=_stride(value))
+                indices[labels[name]] = ws.native.index(at)._replace(base=given[name], stride=_stride(value))
         if (part, k) in self._caches:
             by_step = {**by_step, "cache": self._caches[part, k]}
         for name, value in by_step.items():

@@ -150,7 +150,7 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         pose: wp.int32,
         x: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
-        radius: wp.array(dtype=real),
+        radius_now: wp.array(dtype=real),
         obstacles: wp.array2d(dtype=Obstacle),
         distances: wp.array(dtype=real),
         stuck: wp.array2d(dtype=vec3),
@@ -163,14 +163,14 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         Sets the particles that touch one, ``near[: touching[0]]``, in increasing order.
         """
         count = near_obstacles(
-            c, obstacles.shape[1] - c.faces, x[now], v[now], radius, v_now, stuck[after], near
+            c, obstacles.shape[1] - c.faces, x[now], v[now], radius_now, v_now, stuck[after], near
         )
         number = wp.int32(0)
         for q in range(count):
             p = near[q]
             v_p, stuck_p, touches = touch(
                 obstacles, distances, obstacle_row(c, p, pose), c.faces, c.dt, x[now, p], v[now, p], stuck[now, p],
-                radius[p],
+                radius_now[p],
             )  # fmt: skip
             if touches > 0:
                 v_now[p] = v_p
@@ -188,17 +188,17 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         v: wp.array2d(dtype=vec3),
         C: wp.array2d(dtype=mat33),
         tau: wp.array2d(dtype=mat33),
-        mass: wp.array(dtype=real),
-        vol0: wp.array(dtype=real),
+        mass_now: wp.array(dtype=real),
+        vol_now: wp.array(dtype=real),
         v_now: wp.array(dtype=vec3),
         spans: wp.array(dtype=wp.int32),
         grids: wp.array2d(dtype=vec4),
     ):
         """As `kernels.p2g`, and clears all grids before."""
         if wp.static(contact):
-            p2g_loop(c, x[now], v_now, C[now], tau[cached], mass, vol0, spans, grids)
+            p2g_loop(c, x[now], v_now, C[now], tau[cached], mass_now, vol_now, spans, grids)
         else:
-            p2g_loop(c, x[now], v[now], C[now], tau[cached], mass, vol0, spans, grids)
+            p2g_loop(c, x[now], v[now], C[now], tau[cached], mass_now, vol_now, spans, grids)
 
     @kernel
     def grid_update(
@@ -231,7 +231,7 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         cached: wp.int32,
         step: wp.int32,
         grids: wp.array2d(dtype=vec4),
-        mass: wp.array(dtype=real),
+        mass_now: wp.array(dtype=real),
         x: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
         C: wp.array2d(dtype=mat33),
@@ -241,7 +241,7 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
     ):
         """As `kernels.g2p`, for particles that are not clamped."""
         g2p_loop(
-            c, step, mass, grids[1], x[now], F[now], x[after], v[after], C[after], F_trial[cached], faults
+            c, step, mass_now, grids[1], x[now], F[now], x[after], v[after], C[after], F_trial[cached], faults
         )
 
     @kernel
@@ -287,7 +287,7 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         now: wp.int32,
         after: wp.int32,
         grids: wp.array2d(dtype=vec4),
-        mass: wp.array(dtype=real),
+        mass_now: wp.array(dtype=real),
         x: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
         C: wp.array2d(dtype=mat33),
@@ -300,7 +300,7 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
     ):
         """As `adjoint_kernels.g2p_adjoint`, for particles that are not clamped."""
         g2p_adjoint_loop(
-            c, mass, grids[1], x[now], F[now], x[after], v[after], C[after], grad_v, grad_C, grad_F_trial,
+            c, mass_now, grids[1], x[now], F[now], x[after], v[after], C[after], grad_v, grad_C, grad_F_trial,
             grad_x, grad_F, grids[2],
         )  # fmt: skip
 
@@ -346,8 +346,8 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         v: wp.array2d(dtype=vec3),
         C: wp.array2d(dtype=mat33),
         tau: wp.array2d(dtype=mat33),
-        mass: wp.array(dtype=real),
-        vol0: wp.array(dtype=real),
+        mass_now: wp.array(dtype=real),
+        vol_now: wp.array(dtype=real),
         v_now: wp.array(dtype=vec3),
         grids: wp.array2d(dtype=vec4),
         grad_x: wp.array(dtype=vec3),
@@ -358,11 +358,33 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         """As `adjoint_kernels.p2g_adjoint` without contact: grad_v is that of the velocity after it."""
         if wp.static(contact):
             p2g_adjoint_loop(
-                c, x[now], v_now, C[now], tau[cached], mass, vol0, grids[2], grad_x, grad_v, grad_C, grad_tau
+                c,
+                x[now],
+                v_now,
+                C[now],
+                tau[cached],
+                mass_now,
+                vol_now,
+                grids[2],
+                grad_x,
+                grad_v,
+                grad_C,
+                grad_tau,
             )
         else:
             p2g_adjoint_loop(
-                c, x[now], v[now], C[now], tau[cached], mass, vol0, grids[2], grad_x, grad_v, grad_C, grad_tau
+                c,
+                x[now],
+                v[now],
+                C[now],
+                tau[cached],
+                mass_now,
+                vol_now,
+                grids[2],
+                grad_x,
+                grad_v,
+                grad_C,
+                grad_tau,
             )
 
     @kernel
@@ -372,7 +394,7 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         pose: wp.int32,
         x: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
-        radius: wp.array(dtype=real),
+        radius_now: wp.array(dtype=real),
         obstacles: wp.array2d(dtype=Obstacle),
         distances: wp.array(dtype=real),
         stuck: wp.array2d(dtype=vec3),
@@ -387,7 +409,7 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
             p = near[q]
             g_x, g_v, g_s = touch_adjoint(
                 obstacles, distances, obstacle_row(c, p, pose), c.faces, c.dt, x[now, p], v[now, p],
-                stuck[now, p], radius[p], grad_v[p], grad_stuck[p],
+                stuck[now, p], radius_now[p], grad_v[p], grad_stuck[p],
             )  # fmt: skip
             grad_x[p] = grad_x[p] + g_x
             grad_v[p] = g_v
@@ -402,8 +424,8 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
     def add_loop(added: wp.array(dtype=mat33), total: wp.array(dtype=mat33)): ...
 
     @kernel
-    def add(c: GridConstants, added: wp.array(dtype=mat33), total: wp.array(dtype=mat33)):
-        add_loop(added, total)
+    def add(c: GridConstants, grad_F_elastic: wp.array(dtype=mat33), grad_F: wp.array(dtype=mat33)):
+        add_loop(grad_F_elastic, grad_F)
 
     return SimpleNamespace(
         add=add,

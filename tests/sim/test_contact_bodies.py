@@ -63,7 +63,7 @@ def test_segments_do_not_change_the_gradient(cache_bytes):
     workspace = path.x.grad_fn.simulation.workspace
     assert workspace.size.n_checkpoints == segments
     buffers = (*workspace.states, *workspace.checkpoints)
-    buffers += (workspace.tau, workspace.F_trial, *workspace.grids[:, : model.nodes**3])
+    buffers += (workspace.tau, workspace.F_trial, *workspace.native.grids[:, : model.nodes**3])
     assert 0.9 * memory < sum(buffer.nbytes for buffer in buffers) <= memory
     for one, other in zip(actual, expected, strict=True):
         assert torch.equal(one, other)
