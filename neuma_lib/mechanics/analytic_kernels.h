@@ -38,7 +38,6 @@
     };
     // u[k], v[k] are the columns of U and V. `kept` is written, or read if `again`.
     auto decompose = [&](const Pack* F, Pack (*u)[3], Pack (*v)[3], Pack* singular, Pack* kept, bool again) {
-        {ROUND_ALL}
         if (kept && again) {
             for (int k = 0; k < 3; ++k) {
                 for (int i = 0; i < 3; ++i) {
@@ -254,7 +253,8 @@
         for (int k = 0; k < 9; ++k) grad_F[k] = grad_F[k] + gJ * cofactor[k];
     };
     // Fibres, c[3 ...]: half their modulus, exponent, direction. Strain, and tension with its slope by the strain.
-    auto fibre = [&](const Real* c, const Pack* F, Pack* along, Pack& strain, Pack& growth, Pack& tension, Pack& slope) {
+    auto fibre = [&](const Real* c, const Pack* F, Pack* along, Pack& strain, Pack& growth, Pack& tension,
+                     Pack& slope) {
         for (int i = 0; i < 3; ++i) along[i] = F[3 * i] * c[5] + F[3 * i + 1] * c[6] + F[3 * i + 2] * c[7];
         strain = dot(along, along) - one;
         const Pack exponent = c[4] * strain * strain;
@@ -321,7 +321,8 @@
         coaxial_stress(c, u, s, tau);
         if (law == FibreReinforced) add_fibres(c, F, tau);
     };
-    auto stress_vjp = [&](const Real* c, const Pack* F, const Pack* g, Pack* grad_F, Pack* grad_c, Pack* kept = nullptr) {
+    auto stress_vjp = [&](const Real* c, const Pack* F, const Pack* g, Pack* grad_F, Pack* grad_c,
+                          Pack* kept = nullptr) {
         const int law = (int)c[0];
         no_gradient(grad_c);
         if (is_tensor_law(law)) {
@@ -474,7 +475,8 @@
         return true;
     };
     // F = U diag(y) V^T where y differs from s, else F_trial; sets s to y
-    auto coaxial_return = [&](const Real* c, const Pack (*u)[3], const Pack (*v)[3], Pack* s, const Pack* F_trial, Pack* F) {
+    auto coaxial_return = [&](const Real* c, const Pack (*u)[3], const Pack (*v)[3], Pack* s, const Pack* F_trial,
+                              Pack* F) {
         const Pack gy[3] = {zero, zero, zero};
         Pack y[3], value[9];
         Mask yields;
@@ -514,7 +516,8 @@
         decompose(F_trial, u, v, s, kept, false);
         coaxial_return(c, u, v, s, F_trial, F);
     };
-    auto return_vjp = [&](const Real* c, const Pack* F_trial, const Pack* g, Pack* grad_F, Pack* grad_c, Pack* kept = nullptr) {
+    auto return_vjp = [&](const Real* c, const Pack* F_trial, const Pack* g, Pack* grad_F, Pack* grad_c,
+                          Pack* kept = nullptr) {
         no_gradient(grad_c);
         if ((int)c[0] == Identity) {
             for (int k = 0; k < 9; ++k) grad_F[k] = g[k];
@@ -526,8 +529,8 @@
         coaxial_return_vjp(c, u, v, s, G, g, grad_F, grad_c);
     };
 
-// Return map and the stress after it, with one decomposition instead of two: the return keeps U and V. Coefficients c of
-// the plasticity and ce of the elasticity.
+// Return map and the stress after it, with one decomposition instead of two, because the return keeps U and V.
+// Coefficients c of the plasticity and ce of the elasticity.
 //// flow
     auto flow = [&](const Real* c, const Real* ce, const Pack* F_trial, Pack* F, Pack* tau, Pack* kept = nullptr) {
         if ((int)c[0] == Identity || is_tensor_law((int)ce[0])) {

@@ -15,11 +15,9 @@ from torch import Tensor
 from neuma_lib.device import native_source, start_warp
 from neuma_lib.mechanics.fused_launch import launch_blocks
 from neuma_lib.mechanics.singular_values_kernels import (
-    CPU_WIDTH,
     END,
     FUSE,
     MATH,
-    ROUND_ALL,
     SVD,
     TYPES,
     filled,
@@ -60,6 +58,8 @@ COEFFICIENTS = 7
 """Largest number of coefficients of a law."""
 KEPT = 21
 """Numbers per row in a cache: U, V and the singular values."""
+CPU_WIDTH = {torch.float32: 32, torch.float64: 16}
+"""Rows in a pack on a CPU: 1024 bits, so that two or more registers hide the latency of roots and quotients."""
 THREADS = 64
 """Threads per block on a GPU."""
 
@@ -71,8 +71,10 @@ def row(law: str, coefficients: tuple[Tensor | float, ...]) -> Tensor:
     return torch.stack([torch.as_tensor(x, dtype=torch.float64, device=like.device) for x in numbers])
 
 
-def laws(dtype: torch.dtype) -> str:
-    """C++ source that defines `stress`, `return_map`, `flow` and their adjoints, see ``analytic_kernels.h``."""
+def laws(dtype: torch.dtype, width: int | None = None) -> str:
+    """C++ source that defines `stress`, `return_map`, `flow` and their adjoints, see ``analytic_kernels.h``.
+
+    ``width`` is the number of particles in a pack on a CPU, by default `CPU_WIDTH`."""
     parts = native_source(__file__, ".h")
     constants = (
         f"    enum {{ {', '.join(LAWS)} }};\n    const int COEFFICIENTS = {COEFFICIENTS}, KEPT = {KEPT};\n"
@@ -81,7 +83,7 @@ def laws(dtype: torch.dtype) -> str:
         constants += f"    const Real {name} = Real({value!r});\n"
     text = FUSE + TYPES + constants + MATH
     text += "".join(parts[name] for name in ("functions", "elasticity", "plasticity", "flow"))
-    return filled(text.replace("{ROUND_ALL}", ROUND_ALL).replace("{SVD}", SVD), dtype)
+    return filled(text.replace("{SVD}", SVD), dtype, width or CPU_WIDTH[dtype])
 
 
 def source(kind: Kind, backward: bool, dtype: torch.dtype) -> str:
@@ -136,7 +138,7 @@ def vjp_kernel(kind: Kind, dtype: torch.dtype):
 
 def partial_shape(copies: int, n: int, F: Tensor) -> tuple[int, int, int]:
     """Shape (copies, packs, COEFFICIENTS) of the partials of a vjp for n rows like F of all copies."""
-    return copies, pack_count(n // copies, F.device, F.dtype), COEFFICIENTS
+    return copies, pack_count(n // copies, F.device, CPU_WIDTH[F.dtype]), COEFFICIENTS
 
 
 def _blocks(F: Tensor) -> int:
@@ -146,7 +148,7 @@ def _blocks(F: Tensor) -> int:
 
 def cache_shape(copies: int, n: int, F: Tensor) -> tuple[int, int, int]:
     """Shape (packs, KEPT, CPU_WIDTH) of memory for the SVD of n rows like F of all copies on a CPU."""
-    return copies * pack_count(n // copies, F.device, F.dtype), KEPT, CPU_WIDTH[F.dtype]
+    return copies * pack_count(n // copies, F.device, CPU_WIDTH[F.dtype]), KEPT, CPU_WIDTH[F.dtype]
 
 
 def new_cache(F: Tensor, copies: int) -> Tensor | None:

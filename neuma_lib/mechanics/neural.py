@@ -28,7 +28,7 @@ from neuma_lib.mechanics.adaptor import AdaptableConstitutive, AdaptableLaw, lay
 from neuma_lib.mechanics.law import Elasticity, Plasticity, Weights
 from neuma_lib.mechanics.neural_kernels import FEATURES, feature_kernel, output_kernels
 from neuma_lib.mechanics.singular_values import rotation_and_singular_values
-from neuma_lib.mechanics.singular_values_kernels import pack_count
+from neuma_lib.mechanics.singular_values_kernels import CPU_WIDTH, pack_count
 
 WIDTH = 64
 SHAPES = ((WIDTH, FEATURES), (WIDTH, WIDTH), (9, WIDTH))
@@ -148,7 +148,7 @@ class NeuralConstitutive(AdaptableConstitutive):
 
     def _network(self, F: Tensor, weights: Weights, state: _Forward) -> None:
         """Fill ``state`` from the rows F."""
-        packs = pack_count(len(F), F.device, F.dtype)
+        packs = pack_count(len(F), F.device, CPU_WIDTH[F.dtype])
         launch(feature_kernel(F.dtype), packs, F, state.z, state.R, state.Vh, len(F))
         W0, W1, W2 = weights
         torch.mm(state.z, W0.mT, out=state.a0)

@@ -12,7 +12,9 @@
 #else
     typedef Real Pack __attribute__((vector_size(CPU_WIDTH * sizeof(Real))));
     const int WIDTH = CPU_WIDTH;
-    #define LANE(x, l) (x)[l]
+    // Through memory, because inserting numbers into a pack of several registers is several times slower. A set lane
+    // of a mask is not a number, so that it converts to true.
+    #define LANE(x, l) ((Real*)&(x))[l]
     #define SQRT(x) __builtin_elementwise_sqrt(x)
 #endif
     #define DIVIDE(x, y) ((x) / (y))
@@ -23,13 +25,8 @@
     #pragma clang fp contract(fast)
 #endif
 
-// First in a block: rounds every product.
-//// round_all
-#if defined(__clang__)
-    #pragma clang fp contract(off)
-#endif
-
-// Functions of a pack and constants. On a CPU exp and log are series with an error of one or two units in the last place.
+// Constants and functions of a pack. On a CPU exp and log are series with an error of one or two units in the last
+// place.
 //// math
     Pack zero;
     for (int l = 0; l < WIDTH; ++l) LANE(zero, l) = Real(0);

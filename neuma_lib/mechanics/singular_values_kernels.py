@@ -21,19 +21,19 @@ CPU_WIDTH = {torch.float32: 16, torch.float64: 8}
 SWEEPS = {torch.float32: 3, torch.float64: 4}
 """Cyclic Jacobi sweeps that reduce the off-diagonal of A^T A to round-off (quadratic convergence from the second)."""
 _PARTS = native_source(__file__, ".h")
-TYPES, FUSE, ROUND_ALL, MATH, LOAD, SVD, STORE, END = (
-    _PARTS[name] for name in ("types", "fuse", "round_all", "math", "load", "svd", "store", "end")
+TYPES, FUSE, MATH, LOAD, SVD, STORE, END = (
+    _PARTS[name] for name in ("types", "fuse", "math", "load", "svd", "store", "end")
 )
 
 
 def snippet(*parts: str, dtype: torch.dtype) -> str:
     """C++ source of a kernel over packs from its parts, usually `LOAD`, `SVD` and code that uses the result."""
-    return filled("".join((TYPES, _PARTS["pack"], *parts, END)), dtype)
+    return filled("".join((FUSE, TYPES, _PARTS["pack"], *parts, END)), dtype)
 
 
-def filled(text: str, dtype: torch.dtype) -> str:
-    """C++ source with the scalar type, the size of a pack and the number of Jacobi sweeps substituted."""
-    text = text.replace("CPU_WIDTH", str(CPU_WIDTH[dtype])).replace("SWEEPS", str(SWEEPS[dtype]))
+def filled(text: str, dtype: torch.dtype, width: int | None = None) -> str:
+    """C++ source with the scalar type, the size of a pack (default `CPU_WIDTH`) and the number of Jacobi sweeps."""
+    text = text.replace("CPU_WIDTH", str(width or CPU_WIDTH[dtype])).replace("SWEEPS", str(SWEEPS[dtype]))
     return text.replace("REAL", {torch.float32: "float", torch.float64: "double"}[dtype])
 
 
@@ -46,9 +46,9 @@ def warp_types(dtype: torch.dtype):
     raise TypeError(f"kernels exist for float32 and float64, not {dtype}")
 
 
-def pack_count(n: int, device: torch.device, dtype: torch.dtype) -> int:
-    """Launch size for n matrices: packs on a CPU, matrices on a GPU."""
-    return -(-n // CPU_WIDTH[dtype]) if device.type == "cpu" else n
+def pack_count(n: int, device: torch.device, width: int) -> int:
+    """Launch size for n matrices: packs of a width on a CPU, matrices on a GPU."""
+    return -(-n // width) if device.type == "cpu" else n
 
 
 @cache

@@ -79,7 +79,6 @@
                 s[k] = kept[18 + k];
             }
         } else {
-            {ROUND_ALL}
             Pack* const singular = s;
             Pack a[9];
             for (int l = 0; l < WIDTH; ++l) {

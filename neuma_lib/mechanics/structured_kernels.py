@@ -23,7 +23,6 @@ from neuma_lib.mechanics.singular_values_kernels import (
     END,
     FUSE,
     MATH,
-    ROUND_ALL,
     SVD,
     TYPES,
     filled,
@@ -120,7 +119,6 @@ def source(kind: str, backward: bool, dtype: torch.dtype) -> str:
     text += "".join(parts[name] for name in body) + parts["end"] + END
     energy = kind == "energy"
     for name, inserted in {
-        "{ROUND_ALL}": ROUND_ALL,
         "{SVD}": SVD,
         "{PLUS_B0}": " + b0[k]" if energy else "",
         "{PLUS_B1}": " + b1[k]" if energy else "",
@@ -215,7 +213,7 @@ def new_cache(F: Tensor) -> Tensor | None:
     """Memory (packs, CACHED, CPU_WIDTH) for the SVD of F (n, 3, 3) on a CPU, None on a GPU."""
     if F.device.type != "cpu":
         return None
-    return F.new_empty(pack_count(len(F), F.device, F.dtype), CACHED, CPU_WIDTH[F.dtype])
+    return F.new_empty(pack_count(len(F), F.device, CPU_WIDTH[F.dtype]), CACHED, CPU_WIDTH[F.dtype])
 
 
 @torch.no_grad()

@@ -3,6 +3,7 @@ an emulation."""
 
 import functools
 import logging
+from pathlib import Path
 
 import pytest
 import torch
@@ -324,6 +325,25 @@ def test_von_mises_yields_by_its_closed_form():
     _, deviator = hencky_deviator(F)
     yields = deviator.norm(dim=1) > part.row()[1]
     assert torch.equal((part.evaluate(F, ()) != F).any(dim=2).any(dim=1), yields) and 20 < yields.sum() < 280
+
+
+X86 = pytest.mark.skipif(
+    not Path("/proc/cpuinfo").exists() or "avx2" not in Path("/proc/cpuinfo").read_text(), reason="needs AVX2"
+)
+
+
+@X86
+@pytest.mark.parametrize("kind", ["elasticity", "plasticity"])
+@pytest.mark.parametrize("flags", ["", "-target-cpu haswell"])
+def test_processors_with_smaller_registers_agree(flags, kind, monkeypatch):
+    """Of 128 and 256 bits, without and with fused multiply-add."""
+    monkeypatch.setattr(wp.config, "cpu_compiler_flags", flags)
+    kernel = kernels.vjp_kernel.__wrapped__(kind, torch.float32)
+    for name in ELASTIC if kind == "elasticity" else PLASTIC:
+        part, F = part_of(name), states(name).float()
+        g, actual = probe(F), torch.full_like(F, torch.nan)
+        launch_blocks(kernel, 1, 1, F, part.row().float(), 1, len(F), None, g, actual, 0)
+        assert distance(actual, part.vjp(F, (), g)[0]) < 1e-5
 
 
 # ----------------------------------------------------------------------------------------------- CUDA
