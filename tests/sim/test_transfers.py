@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from neuma_lib.errors import NonFiniteError
+from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.sim import segment_loop, workspace
 from neuma_lib.sim.batch import rollout_batch
 from neuma_lib.sim.clamps import Clamp
@@ -165,6 +166,27 @@ def test_segments_equal_steps_of_python(contact, name, monkeypatch):
     steps = run(model, bodies, start, frames, **options[0])
     for other in (chunks, steps):
         assert_equal([*other[0], *other[1]], [*expected[0][0], *expected[0][1]])
+
+
+def test_gradients_of_constants():
+    """Of two bodies of one law, and over several segments, as by the kernels of other devices."""
+    model, start = MODELS["particles"], falling("particles")
+
+    def grads(**options):
+        E, limit = (torch.tensor(value, dtype=torch.float64, requires_grad=True) for value in (5e4, 5e2))
+        spec = {
+            "elasticity": {"name": "hencky", "E": E, "nu": 0.3},
+            "plasticity": {"name": "von_mises", "E": E, "nu": 0.3, "yield_stress": limit},
+        }
+        law = analytic_law(spec, dt=DT)
+        bodies = [MaterialRegion(law, 0, 37), MaterialRegion(law, 37, 100)]
+        path = rollout(model, bodies, start, steps=20, frames=(5, 20), **options)
+        return torch.autograd.grad((path.x**2).sum() + path.v.sum(), (E, limit))
+
+    expected = grads(scatter="atomic")
+    assert all(grad != 0 for grad in expected)
+    for options in ({}, {"cache_bytes": 0}, {"memory": 9e5}):
+        assert_near(grads(**options), expected, 1e-9)
 
 
 def test_faults_are_reported_with_step_and_particle():
