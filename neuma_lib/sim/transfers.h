@@ -119,7 +119,8 @@
     };
     // Four numbers of an axis spread over the lanes of a row
     auto spread = [&](const Real (*w)[16], int l) INLINE {
-        const Four a = zero + w[0][l], b = zero + w[1][l], d = zero + w[2][l];
+        const Real w0 = w[0][l], w1 = w[1][l], w2 = w[2][l];
+        const Four a = {w0, w0, w0, w0}, b = {w1, w1, w1, w1}, d = {w2, w2, w2, w2};
         const Eight ab = SHUFFLE(a, b, 0, 1, 2, 3, 4, 5, 6, 7), d0 = SHUFFLE(d, zero, 0, 1, 2, 3, 4, 5, 6, 7);
         return SHUFFLE(ab, d0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
     };
