@@ -74,22 +74,26 @@ class SegmentLoop:
         """Allocate what the reverse loop of a segment needs."""
         if self._reverse is None:
             self._reverse = self._reverse_sequence()
-        for partials in self._partials.values():
-            partials.zero_()
+        for total in self._grad_rows.values():
+            total.zero_()
 
     def reverse(self, last: int, steps: int) -> None:
         """Run the adjoints of steps from ``last`` down."""
         for n in range(last, last - steps, -self._per_call):
             self._reverse.run(n, min(self._per_call, n - last + steps), -1)
+            for key, partials in self._partials.items():
+                self._grad_rows[key] += partials.sum(dim=(0, 2))
+                partials.zero_()
 
     def grad_rows(self, part: str, k: int) -> Tensor:
         """Gradient of the constants of a region's law, summed over the steps since `start_reverse`."""
-        return self._partials[part, k].sum(dim=(0, 2))
+        return self._grad_rows[part, k]
 
     def _reverse_sequence(self) -> LaunchSequence:
         ws = self._ws
-        steps = max(1, ws.size.n_states - 1)
-        self._partials = {}
+        steps = max(1, min(ws.size.n_states - 1, self._per_call))
+        self._partials: dict[tuple[str, int], Tensor] = {}  # of the steps of a call
+        self._grad_rows: dict[tuple[str, int], Tensor] = {}
         adjoints: dict[str, list[Repeated]] = {}
         for part, regions in self._parts.items():
             F, at = (ws.F, _NOW) if part == "elasticity" else (ws.F_trial, _CACHED)
@@ -106,6 +110,7 @@ class SegmentLoop:
                     )
                     self._partials[part, k] = torch.zeros((steps, *shape), dtype=torch.float64)
                     extra["partials"] = self._partials[part, k]
+                    self._grad_rows[part, k] = self._partials[part, k].sum(dim=(0, 2))
                 kernel = analytic_kernels.vjp_kernel(part, ws.size.dtype)
                 adjoints[part].append(self._launch(kernel, part, k, values, extra))
         before = (

@@ -168,7 +168,7 @@ def test_segments_equal_steps_of_python(contact, name, monkeypatch):
         assert_equal([*other[0], *other[1]], [*expected[0][0], *expected[0][1]])
 
 
-def test_gradients_of_constants():
+def test_gradients_of_constants(monkeypatch):
     """Of two bodies of one law, and over several segments, as by the kernels of other devices."""
     model, start = MODELS["particles"], falling("particles")
 
@@ -187,6 +187,8 @@ def test_gradients_of_constants():
     assert all(grad != 0 for grad in expected)
     for options in ({}, {"cache_bytes": 0}, {"memory": 9e5}):
         assert_near(grads(**options), expected, 1e-9)
+    monkeypatch.setattr(segment_loop, "PARTICLE_STEPS", 3 * len(start.x))
+    assert_near(grads(), expected, 1e-9)
 
 
 def test_faults_are_reported_with_step_and_particle():
