@@ -2,6 +2,7 @@
 
     python -m benchmarks.rollout                        # 2,000 particles, 24^3 grid, 100 steps, neural law
     python -m benchmarks.rollout --law stretch          # a structured law of that form, or energy
+    python -m benchmarks.rollout --law von_mises        # an analytic law, or neo_hookean
     python -m benchmarks.rollout --render               # and 20 frames of 1,500 Gaussians at 64 px
     python -m benchmarks.rollout --particles 30000 --grid 32 --steps 400 --device cuda
 
@@ -20,7 +21,8 @@ import torch
 from benchmarks.timing import parser_of
 from neuma_lib.coupling.deformation import deform
 from neuma_lib.coupling.particle_binding import bind
-from neuma_lib.mechanics.adaptor import AdaptableLaw
+from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.mechanics.law import Law
 from neuma_lib.mechanics.neural import neural_law
 from neuma_lib.mechanics.structured import FORMS, structured_law
 from neuma_lib.sim.memory import MemoryPlan
@@ -39,7 +41,7 @@ def rollout_step_by_step(model, law, state, frames):
     """
     bodies = as_regions(law, len(state.x))
     weights, slices = gather_weights(bodies, state.x.dtype)
-    now, seen = state.motion, []
+    now, seen = (*state.motion, state.stuck), []
     for n in range(1, frames[-1] + 1):
         step = Simulation(model, bodies, slices, state, 1, n - 1, MemoryPlan(1, False, 0))
         *after, _ = RolloutFunction.apply(step, [1], None, *now, *weights)
@@ -65,8 +67,13 @@ SOFT = {
 }
 
 
-def soft_law(name: str, device: torch.device) -> AdaptableLaw:
-    """An untrained law of little stiffness with an adaptor, as in training: neural, or structured of a form."""
+ANALYTIC = {"von_mises": SOFT, "neo_hookean": {"elasticity": {"name": "neo_hookean", "E": 1e4, "nu": 0.3}}}
+
+
+def soft_law(name: str, device: torch.device) -> Law:
+    """A law of little stiffness: analytic, or untrained with an adaptor, as in training, neural or structured."""
+    if name in ANALYTIC:
+        return analytic_law(ANALYTIC[name])
     if name == "neural":
         law = neural_law(seed=0)
         law.attach_adaptor(rank=16, alpha=16.0)
@@ -98,7 +105,7 @@ def picture(
 
 
 def measure(
-    rows: dict[str, Callable[[], torch.Tensor]], law: AdaptableLaw, repetitions: int
+    rows: dict[str, Callable[[], torch.Tensor]], law: Law, repetitions: int
 ) -> dict[str, tuple[float, float]]:
     """Seconds of each row's fastest forward and backward pass, rows taken in turns.
 
@@ -127,7 +134,7 @@ def now() -> float:
 
 def main() -> None:
     parser = parser_of(__doc__)
-    parser.add_argument("--law", choices=["neural", *FORMS], default="neural")
+    parser.add_argument("--law", choices=["neural", *FORMS, *ANALYTIC], default="neural")
     parser.add_argument("--particles", type=int, default=2000)
     parser.add_argument("--grid", type=int, default=24)
     parser.add_argument("--steps", type=int, default=100)
@@ -145,6 +152,7 @@ def main() -> None:
     model = MPM(args.grid, 1e-3)
     law = soft_law(args.law, device)
     state = falling_cube(args.particles, device)
+    state.v.requires_grad_()  # what an analytic law is differentiated for
     frames = sorted({max(1, round(args.steps * (i + 1) / args.frames)) for i in range(args.frames)})
     options = dict(steps=args.steps, frames=frames, skip_free_flight=False)
 

@@ -14,15 +14,10 @@ import math
 import torch
 from torch import Tensor
 
+from neuma_lib.mechanics.analytic_kernels import FIBRE_EXPONENT_MAX, STRETCH_MIN
 from neuma_lib.mechanics.catalogue import ELASTICITY, MODULI, lame
 from neuma_lib.mechanics.isotropic import Constants, isotropic_stress
 from neuma_lib.mechanics.law import Elasticity, Weights
-
-STRETCH_MIN = 0.05
-"""Logarithms are of max(sigma, STRETCH_MIN), as in NCLaw, which bounds the stress of a crushed element."""
-
-FIBRE_EXPONENT_MAX = 8.0
-"""Bound on the exponent of the fibre term, which limits its stiffness to e^8 = 3,000 times that at rest."""
 
 
 class AnalyticElasticity(Constants, Elasticity):
@@ -61,6 +56,11 @@ def _deviator(y: Tensor) -> Tensor:
 class FixedCorotated(AnalyticElasticity, name="fixed_corotated"):
     """tau = 2 mu (F - R) F^T + lam J (J - 1) I (Stomakhin et al. 2012)."""
 
+    @staticmethod
+    def coefficients(E, nu):
+        mu, lam = lame(E, nu)
+        return 2 * mu, lam
+
     def principal(self, sigma, mu, lam):
         J = _volume_ratio(sigma)
         return 2 * mu * (sigma - 1) * sigma + lam * J * (J - 1)
@@ -68,6 +68,11 @@ class FixedCorotated(AnalyticElasticity, name="fixed_corotated"):
 
 class StVK(AnalyticElasticity, name="stvk"):
     """Saint Venant-Kirchhoff: tau = F (2 mu E + lam tr(E) I) F^T with Green's strain E = (F^T F - I)/2."""
+
+    @staticmethod
+    def coefficients(E, nu):
+        mu, lam = lame(E, nu)
+        return 2 * mu, lam
 
     def principal(self, sigma, mu, lam):
         strain = 0.5 * (sigma - 1) * (sigma + 1)
@@ -77,6 +82,11 @@ class StVK(AnalyticElasticity, name="stvk"):
 class Hencky(AnalyticElasticity, name="hencky"):
     """tau = U (2 mu eps + lam tr(eps) I) U^T with the logarithmic strain eps = log sigma."""
 
+    @staticmethod
+    def coefficients(E, nu):
+        mu, lam = lame(E, nu)
+        return 2 * mu, lam
+
     def principal(self, sigma, mu, lam):
         strain = sigma.clamp(min=STRETCH_MIN).log()
         return 2 * mu * strain + lam * strain.sum(1, keepdim=True)
@@ -85,6 +95,10 @@ class Hencky(AnalyticElasticity, name="hencky"):
 class NeoHookean(AnalyticElasticity, name="neo_hookean"):
     """Compressible neo-Hookean: tau = mu (F F^T - I) + lam log(J) I."""
 
+    @staticmethod
+    def coefficients(E, nu):
+        return lame(E, nu)
+
     def principal(self, sigma, mu, lam):
         J = _volume_ratio(sigma).clamp(min=STRETCH_MIN**3)
         return mu * (sigma - 1) * (sigma + 1) + lam * J.log()
@@ -92,6 +106,10 @@ class NeoHookean(AnalyticElasticity, name="neo_hookean"):
 
 class Fluid(AnalyticElasticity, name="fluid"):
     """Weakly compressible fluid: tau = lam J (J - 1) I."""
+
+    @staticmethod
+    def coefficients(E, nu):
+        return lame(E, nu)[1:]
 
     def principal(self, sigma, mu, lam):
         J = _volume_ratio(sigma)
@@ -106,6 +124,11 @@ class Tait(AnalyticElasticity, name="tait"):
     whose kappa is K / 7. With `viscous_flow` it is a Newtonian fluid: dev tau = 2 viscosity dev D in steady flow, so
     that PAC-NeRF's mu is twice the viscosity.
     """
+
+    @staticmethod
+    def coefficients(E, nu):
+        mu, lam = lame(E, nu)
+        return 2 * mu, (lam + 2 * mu / 3) / 7
 
     def principal(self, sigma, mu, lam):
         strain, _ = _isochoric_strain(sigma)
@@ -122,6 +145,11 @@ class Ogden(AnalyticElasticity, name="ogden"):
 
     constants = ELASTICITY["ogden"]
 
+    @staticmethod
+    def coefficients(E, nu, alpha):
+        mu, lam = lame(E, nu)
+        return 2 * mu / alpha, alpha, lam + 2 * mu / 3
+
     def principal(self, sigma, mu, lam, alpha):
         strain, log_J = _isochoric_strain(sigma)
         return 2 * mu / alpha * _deviator((alpha * strain).exp()) + (lam + 2 * mu / 3) * log_J
@@ -137,10 +165,21 @@ class MooneyRivlin(AnalyticElasticity, name="mooney_rivlin"):
 
     constants = ELASTICITY["mooney_rivlin"]
 
+    @staticmethod
+    def coefficients(E, nu, q):
+        mu, lam = lame(E, nu)
+        return mu * (1 - q), mu * q, lam + 2 * mu / 3
+
     def principal(self, sigma, mu, lam, q):
         strain, log_J = _isochoric_strain(sigma)
         shear = (1 - q) * _deviator((2 * strain).exp()) - q * _deviator((-2 * strain).exp())
         return mu * shear + (lam + 2 * mu / 3) * log_J
+
+
+def _direction(azimuth: Tensor, elevation: Tensor) -> Tensor:
+    """Unit vector (3,) of two angles in degrees."""
+    azimuth, elevation = azimuth * (math.pi / 180), elevation * (math.pi / 180)
+    return torch.stack([elevation.cos() * azimuth.cos(), elevation.sin(), elevation.cos() * azimuth.sin()])
 
 
 class FibreReinforced(Hencky, name="fibre_reinforced"):
@@ -156,15 +195,20 @@ class FibreReinforced(Hencky, name="fibre_reinforced"):
 
     constants = ELASTICITY["fibre_reinforced"]
 
+    @staticmethod
+    def coefficients(E, nu, fibre_modulus, fibre_exponent, azimuth, elevation):
+        direction = _direction(azimuth, elevation).unbind()
+        return *Hencky.coefficients(E, nu), fibre_modulus / 2, fibre_exponent, *direction
+
     def response(self, F: Tensor, weights: Weights) -> Tensor:
         constants = self.with_weights(weights)
         mu, lam = lame(constants["E"], constants["nu"])
-        azimuth, elevation = (
-            torch.as_tensor(constants[key], dtype=F.dtype, device=F.device) * (math.pi / 180)
-            for key in ("azimuth", "elevation")
+        a_F = F @ _direction(
+            *(
+                torch.as_tensor(constants[key], dtype=F.dtype, device=F.device)
+                for key in ("azimuth", "elevation")
+            )
         )
-        a = torch.stack([elevation.cos() * azimuth.cos(), elevation.sin(), elevation.cos() * azimuth.sin()])
-        a_F = F @ a
         strain = (a_F**2).sum(1) - 1
         exponent = (constants["fibre_exponent"] * strain**2).clamp(max=FIBRE_EXPONENT_MAX)
         tension = constants["fibre_modulus"] / 2 * strain * exponent.exp()

@@ -14,6 +14,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
+from neuma_lib.mechanics import analytic_kernels as kernels
 from neuma_lib.mechanics.catalogue import Constant, check_constants
 from neuma_lib.mechanics.singular_values import away_from_zero, rotation_and_singular_values, svd3
 
@@ -144,13 +145,17 @@ def isotropic_deformation(F: Tensor, function: PrincipalFunction) -> Tensor:
 
 
 class Constants(nn.Module):
-    """Mix-in that checks and holds the constants of a law.
+    """Mix-in of an `Elasticity` or `Plasticity` that checks and holds the constants of a law.
 
     A number is fixed. A tensor that requires a gradient becomes one of the law's ``weights()``, in the order of
     ``constants``, so that an analytic law can be fitted like a neural one.
+
+    The built-in laws state their ``coefficients``, a static function of the constants as tensors, and are evaluated by
+    :mod:`analytic_kernels`. Other laws, which may derive from these, are evaluated by `response`.
     """
 
     constants: dict[str, Constant] = {}
+    part: str
 
     def __init__(self, **values: float | Tensor):
         super().__init__()
@@ -170,3 +175,88 @@ class Constants(nn.Module):
     def with_weights(self, weights: tuple[Tensor, ...]) -> dict[str, float | Tensor]:
         """All constants, with the given weights in place of the fitted ones."""
         return {**self.values, **dict(zip(self._fitted(), weights, strict=True))}
+
+    @property
+    def native(self) -> bool:
+        """Whether the law has a kernel."""
+        return "coefficients" in vars(type(self))
+
+    @property
+    def capturable(self) -> bool:
+        """Whether `evaluate` and `vjp` can be recorded in a CUDA graph. The constants are then part of it."""
+        return self.native and not self._fitted()
+
+    def row(self, weights: tuple[Tensor, ...] = ()) -> Tensor:
+        """Row of the kernels (1 + COEFFICIENTS,) in float64, differentiable in the constants. ``weights`` replace the
+        fitted ones if given."""
+        values = self.with_weights(weights) if weights else self.values
+        device = next((w.device for w in weights), None)
+        tensors = {key: torch.as_tensor(x, dtype=torch.float64, device=device) for key, x in values.items()}
+        return kernels.row(type(self).__name__, self.coefficients(**tensors))
+
+    @property
+    def native_rows(self) -> bool:
+        return self.native
+
+    @property
+    def keeps_singular_values(self) -> bool:
+        return self.native and type(self).__name__ not in kernels.WITHOUT_SINGULAR_VALUES
+
+    def kernel_rows(self, F: Tensor, weights: tuple[Tensor, ...]) -> Tensor:
+        return self._rows(F, weights)
+
+    def _rows(self, F: Tensor, weights: tuple[Tensor, ...]) -> Tensor:
+        """Rows (1, 1 + COEFFICIENTS) for F, kept while neither the weights nor the dtype and device change."""
+        state = F.dtype, F.device, [w._version for w in weights]
+        kept = self.__dict__.get("_kept")
+        if kept is None or kept[0] != state or not _same(kept[1], weights):
+            with torch.no_grad():
+                rows = self.row(weights)[None].to(F.device, F.dtype)
+            self.__dict__["_kept"] = kept = state, weights, rows
+        return kept[2]
+
+    def evaluate(self, F: Tensor, weights: tuple[Tensor, ...], out: Tensor | None = None) -> Tensor:
+        if not self.native:
+            return super().evaluate(F, weights, out)
+        return kernels.evaluate(self.part, F, self._rows(F, weights), out)
+
+    def evaluate_with_cache(self, F, weights, out=None, cache=None):
+        if not self.keeps_singular_values:
+            return self.evaluate(F, weights, out), None
+        cache = kernels.new_cache(F, 1) if cache is None else cache
+        return kernels.evaluate(self.part, F, self._rows(F, weights), out, cache), cache
+
+    def vjp(self, F, weights, grad_out, cache=None, grad_F=None, grad_weights=None):
+        if not self.native:
+            return super().vjp(F, weights, grad_out, cache, grad_F, grad_weights)
+        if grad_weights is None:
+            grad_weights = tuple(torch.zeros_like(w) for w in weights)
+        sums = grad_weights if _are_rows(grad_weights) else self.accumulators(F, grad_weights)
+        grad_rows = sums[0] if weights else None
+        grad_F = kernels.vjp(self.part, F, self._rows(F, weights), grad_out, cache, grad_F, grad_rows)
+        if sums is not grad_weights:
+            self.add_up(sums, weights, grad_weights)
+        return grad_F, grad_weights
+
+    def accumulators(self, F, grad_weights):
+        if not self.native or not grad_weights:
+            return grad_weights
+        return (torch.zeros(1, 1 + kernels.COEFFICIENTS, dtype=torch.float64, device=F.device),)
+
+    def add_up(self, accumulators, weights, grad_weights):
+        if not _are_rows(accumulators):
+            return
+        with torch.enable_grad():
+            leaves = [w.detach().requires_grad_() for w in weights]
+            grads = torch.autograd.grad(self.row(tuple(leaves)), leaves, accumulators[0][0])
+        for total, grad in zip(grad_weights, grads, strict=True):
+            total.add_(grad)
+
+
+def _are_rows(accumulators: tuple[Tensor, ...]) -> bool:
+    """Whether these are gradients of rows instead of constants."""
+    return len(accumulators) == 1 and accumulators[0].ndim == 2
+
+
+def _same(one: tuple[Tensor, ...], other: tuple[Tensor, ...]) -> bool:
+    return len(one) == len(other) and all(a is b for a, b in zip(one, other, strict=True))

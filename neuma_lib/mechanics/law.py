@@ -35,6 +35,14 @@ class Constitutive(nn.Module):
     capturable = False
     """Whether `evaluate` and `vjp` can be recorded in a CUDA graph: they read nothing from the device and reuse all
     scratch memory."""
+    native = False
+    """Whether `evaluate` and `vjp` are kernels, with `response` as their reference, instead of torch."""
+    native_rows = False
+    """Whether the law is one of `analytic_kernels`, which `kernel_rows` describes."""
+    keeps_singular_values = False
+    """Whether these kernels can keep singular values for the adjoint (`analytic_kernels.new_cache`)."""
+    identity = False
+    """Whether the result is always F."""
     adjoint_precision: AdjointPrecision = "single"
     """Precision of the matrix products in `vjp`. "half" uses factors of 11 bits and sums them in float32, for laws
     with such kernels."""
@@ -123,6 +131,10 @@ class Constitutive(nn.Module):
             total.add_(grad)
         return result, grad_weights
 
+    def kernel_rows(self, F: Tensor, weights: Weights) -> Tensor:
+        """Rows for the kernels of `analytic_kernels` of the dtype and device of F."""
+        raise NotImplementedError
+
     def accumulators(self, F: Tensor, grad_weights: Weights) -> Weights:
         """Zero buffers to which many calls of `vjp` for F (N, 3, 3) add most cheaply, to be reduced by `add_up`.
 
@@ -130,8 +142,8 @@ class Constitutive(nn.Module):
         """
         return grad_weights
 
-    def add_up(self, accumulators: Weights, grad_weights: Weights) -> None:
-        """Add the contents of the buffers of :meth:`accumulators` to ``grad_weights``."""
+    def add_up(self, accumulators: Weights, weights: Weights, grad_weights: Weights) -> None:
+        """Add the contents of the buffers of :meth:`accumulators` to ``grad_weights``, the gradients of ``weights``."""
 
 
 class Elasticity(Constitutive):

@@ -28,7 +28,7 @@ from neuma_lib.mechanics.adaptor import AdaptableConstitutive, AdaptableLaw, lay
 from neuma_lib.mechanics.law import Elasticity, Plasticity, Weights
 from neuma_lib.mechanics.neural_kernels import FEATURES, feature_kernel, output_kernels
 from neuma_lib.mechanics.singular_values import rotation_and_singular_values
-from neuma_lib.mechanics.singular_values_kernels import pack_count
+from neuma_lib.mechanics.singular_values_kernels import CPU_WIDTH, pack_count
 
 WIDTH = 64
 SHAPES = ((WIDTH, FEATURES), (WIDTH, WIDTH), (9, WIDTH))
@@ -92,6 +92,7 @@ class NeuralConstitutive(AdaptableConstitutive):
     kind: str
     scale: float
     capturable = True
+    native = True
     fused: bool | None = None
     """Whether evaluate and vjp use :mod:`neural_fused`: False never, True always, None where it is supported."""
 
@@ -147,7 +148,8 @@ class NeuralConstitutive(AdaptableConstitutive):
 
     def _network(self, F: Tensor, weights: Weights, state: _Forward) -> None:
         """Fill ``state`` from the rows F."""
-        launch(feature_kernel(F.dtype), pack_count(len(F), F.device), F, state.z, state.R, state.Vh, len(F))
+        packs = pack_count(len(F), F.device, CPU_WIDTH[F.dtype])
+        launch(feature_kernel(F.dtype), packs, F, state.z, state.R, state.Vh, len(F))
         W0, W1, W2 = weights
         torch.mm(state.z, W0.mT, out=state.a0)
         aten.gelu.out(state.a0, out=state.h0)
@@ -159,7 +161,7 @@ class NeuralConstitutive(AdaptableConstitutive):
         return (neural_fused.partial_sums(F),) if self.uses_fused(F) else grad_weights
 
     @torch.no_grad()
-    def add_up(self, accumulators, grad_weights):
+    def add_up(self, accumulators, weights, grad_weights):
         if len(accumulators) != len(grad_weights):
             neural_fused.add_up(*accumulators, grad_weights)
 

@@ -15,8 +15,8 @@ import math
 import torch
 from torch import Tensor
 
+from neuma_lib.mechanics.analytic_kernels import STRETCH_MIN
 from neuma_lib.mechanics.catalogue import PLASTICITY, lame
-from neuma_lib.mechanics.elasticity import STRETCH_MIN
 from neuma_lib.mechanics.isotropic import Constants, isotropic_deformation
 from neuma_lib.mechanics.law import Plasticity, Weights
 
@@ -45,8 +45,19 @@ def hencky_strain(sigma: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 class Identity(Constants, Plasticity, name="identity"):
     """No plasticity: F = F_trial."""
 
+    capturable = True
+    native = True
+    identity = True
+
+    @staticmethod
+    def coefficients():
+        return ()
+
     def response(self, F: Tensor, weights: Weights) -> Tensor:
         return F.clone()
+
+    def evaluate(self, F, weights, out=None):
+        return F.detach().clone() if out is None else out.copy_(F.detach())
 
     def vjp(self, F, weights, grad_out, cache=None, grad_F=None, grad_weights=None):
         result = grad_out.clone() if grad_F is None else grad_F.copy_(grad_out)
@@ -60,6 +71,11 @@ class VonMises(AnalyticPlasticity, name="von_mises"):
     """
 
     constants = PLASTICITY["von_mises"]
+
+    @staticmethod
+    def coefficients(E, nu, yield_stress):
+        mu, _ = lame(E, nu)
+        return yield_stress / (2 * mu), 0.0
 
     def principal(self, sigma, E, nu, yield_stress):
         mu, _ = lame(E, nu)
@@ -88,6 +104,10 @@ class DruckerPrager(AnalyticPlasticity, name="drucker_prager"):
         alpha = math.sqrt(2 / 3) * 2 * sine / (3 - sine)
         return (3 * lam + 2 * mu) / (2 * mu) * alpha
 
+    @staticmethod
+    def coefficients(E, nu, friction_angle, cohesion):
+        return DruckerPrager.slope(E, nu, friction_angle), cohesion
+
     def principal(self, sigma, E, nu, friction_angle, cohesion):
         trace, deviator, norm = hencky_strain(sigma)
         shifted = trace - 3 * cohesion  # trace relative to the apex
@@ -103,6 +123,10 @@ class DruckerPrager(AnalyticPlasticity, name="drucker_prager"):
 class FluidProjection(AnalyticPlasticity, name="fluid_projection"):
     """Removes all shear of a fluid: F = J^(1/3) R. Same stress as the usual J^(1/3) I, but objective."""
 
+    @staticmethod
+    def coefficients():
+        return ()
+
     def principal(self, sigma):
         J = (sigma[:, 0] * sigma[:, 1] * sigma[:, 2])[:, None]
         return J.clamp(min=STRETCH_MIN**3).pow(1 / 3).expand_as(sigma)
@@ -116,6 +140,11 @@ class ViscousFlow(AnalyticPlasticity, name="viscous_flow"):
     """
 
     constants = PLASTICITY["viscous_flow"]
+
+    @staticmethod
+    def coefficients(E, nu, viscosity, dt, yield_stress):
+        mu, _ = lame(E, nu)
+        return yield_stress / (2 * mu), 1 / (1 + mu * dt / viscosity)
 
     def principal(self, sigma, E, nu, viscosity, dt, yield_stress):
         mu, _ = lame(E, nu)
@@ -140,6 +169,19 @@ class CrushableFoam(AnalyticPlasticity, name="crushable_foam"):
     """
 
     constants = PLASTICITY["crushable_foam"]
+
+    @staticmethod
+    def coefficients(E, nu, crush, tension, slope, dt, relaxation):
+        mu, lam = lame(E, nu)
+        half, centre = (crush + tension) / 2, (crush - tension) / (crush + tension)
+        rounding = 4 * crush * tension / (crush + tension) ** 2  # 1 - centre^2 without cancellation
+        return (
+            (lam + 2 * mu / 3) / half,
+            math.sqrt(6) * mu / (slope * half),
+            centre,
+            rounding,
+            relaxation / (relaxation + dt),
+        )
 
     def principal(self, sigma, E, nu, crush, tension, slope, dt, relaxation):
         mu, lam = lame(E, nu)
@@ -166,6 +208,12 @@ class HerschelBulkley(AnalyticPlasticity, name="herschel_bulkley"):
     """
 
     constants = PLASTICITY["herschel_bulkley"]
+
+    @staticmethod
+    def coefficients(E, nu, consistency, exponent, yield_stress, dt):
+        mu, _ = lame(E, nu)
+        log_rate = (dt / math.sqrt(2)).log() + (math.sqrt(2) * mu / consistency).log() / exponent
+        return yield_stress / (2 * mu), log_rate, 1 / exponent
 
     def principal(self, sigma, E, nu, consistency, exponent, yield_stress, dt):
         mu, _ = lame(E, nu)
@@ -204,6 +252,12 @@ def _positive_root(rate: float | Tensor, power: float | Tensor, total: Tensor) -
     return newton_step(u).exp()
 
 
+def _sine_and_alpha(degrees: Tensor) -> tuple[Tensor, Tensor]:
+    """sin x and alpha(x) of an angle, see `CohesiveDruckerPrager`."""
+    sine = torch.sin(degrees * (math.pi / 180))
+    return sine, math.sqrt(2 / 3) * 2 * sine / (3 - sine)
+
+
 class CohesiveDruckerPrager(AnalyticPlasticity, name="cohesive_drucker_prager"):
     """Damp, dense granular material with friction, ``cohesion`` c [Pa] and dilatancy.
 
@@ -215,18 +269,19 @@ class CohesiveDruckerPrager(AnalyticPlasticity, name="cohesive_drucker_prager"):
 
     constants = PLASTICITY["cohesive_drucker_prager"]
 
+    @staticmethod
+    def coefficients(E, nu, friction_angle, cohesion, dilation_angle):
+        mu, lam = lame(E, nu)
+        (sine, alpha), (_, beta) = _sine_and_alpha(friction_angle), _sine_and_alpha(dilation_angle)
+        strength = math.sqrt(2 / 3) * 6 * cohesion * (1 - sine**2).sqrt() / (3 - sine)
+        return (3 * lam + 2 * mu) / (2 * mu) * alpha, strength / (2 * mu), beta
+
     def principal(self, sigma, E, nu, friction_angle, cohesion, dilation_angle):
         mu, lam = lame(E, nu)
         bulk = lam + 2 * mu / 3
 
-        def sine_and_alpha(degrees):
-            sine = torch.sin(
-                torch.as_tensor(degrees, dtype=sigma.dtype, device=sigma.device) * (math.pi / 180)
-            )
-            return sine, math.sqrt(2 / 3) * 2 * sine / (3 - sine)
-
-        sine, alpha = sine_and_alpha(friction_angle)
-        _, beta = sine_and_alpha(dilation_angle)
+        sine, alpha = _sine_and_alpha(torch.as_tensor(friction_angle).to(sigma))
+        _, beta = _sine_and_alpha(torch.as_tensor(dilation_angle).to(sigma))
         strength = math.sqrt(2 / 3) * 6 * cohesion * (1 - sine**2).sqrt() / (3 - sine)
         trace, deviator, norm = hencky_strain(sigma)
         excess = 2 * mu * norm + 3 * bulk * alpha * trace - strength

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from neuma_lib.device import launch
-from neuma_lib.mechanics.singular_values_kernels import pack_count, svd_kernel
+from neuma_lib.mechanics.singular_values_kernels import CPU_WIDTH, pack_count, svd_kernel
 
 
 def svd3(F: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -23,7 +23,7 @@ def svd3(F: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     F = F.detach().contiguous()
     U, sigma, Vh = torch.empty_like(F), F.new_empty(F.shape[:-1]), torch.empty_like(F)
     if len(F):
-        launch(svd_kernel(F.dtype), pack_count(len(F), F.device), F, U, sigma, Vh, len(F))
+        launch(svd_kernel(F.dtype), pack_count(len(F), F.device, CPU_WIDTH[F.dtype]), F, U, sigma, Vh, len(F))
     return U, sigma, Vh
 
 

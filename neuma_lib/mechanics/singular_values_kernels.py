@@ -1,8 +1,8 @@
 """Kernels of `singular_values`: the SVD of 3x3 matrices for CPU lanes and CUDA threads.
 
 An SVD is a long sequence of dependent square roots and divisions, which leaves the vector units of a CPU idle if it
-processes one matrix at a time. ``singular_values_kernels.h`` processes a *pack*: 8 matrices, one per SIMD lane, on a
-CPU (6 times faster), and one matrix per thread on a GPU. It is C++ because Warp's Python functions have no lanes.
+processes one matrix at a time. ``singular_values_kernels.h`` processes a *pack*: 8 or 16 matrices, one per SIMD lane,
+on a CPU (6 times faster), and one matrix per thread on a GPU. It is C++ because Warp's Python functions have no lanes.
 :func:`snippet` composes a kernel of these parts.
 """
 
@@ -15,22 +15,25 @@ from neuma_lib.device import native_source, start_warp
 
 start_warp()
 
-CPU_WIDTH = 8
+CPU_WIDTH = {torch.float32: 16, torch.float64: 8}
+"""Matrices in a pack on a CPU: 512 bits, as several registers on a CPU whose registers are smaller."""
 
 SWEEPS = {torch.float32: 3, torch.float64: 4}
 """Cyclic Jacobi sweeps that reduce the off-diagonal of A^T A to round-off (quadratic convergence from the second)."""
 _PARTS = native_source(__file__, ".h")
-TYPES, LOAD, SVD, STORE, END = (_PARTS[name] for name in ("types", "load", "svd", "store", "end"))
+TYPES, FUSE, MATH, LOAD, SVD, STORE, END = (
+    _PARTS[name] for name in ("types", "fuse", "math", "load", "svd", "store", "end")
+)
 
 
 def snippet(*parts: str, dtype: torch.dtype) -> str:
     """C++ source of a kernel over packs from its parts, usually `LOAD`, `SVD` and code that uses the result."""
-    return filled("".join((TYPES, _PARTS["pack"], *parts, END)), dtype)
+    return filled("".join((FUSE, TYPES, _PARTS["pack"], *parts, END)), dtype)
 
 
-def filled(text: str, dtype: torch.dtype) -> str:
-    """C++ source with the scalar type, the size of a pack and the number of Jacobi sweeps substituted."""
-    text = text.replace("CPU_WIDTH", str(CPU_WIDTH)).replace("SWEEPS", str(SWEEPS[dtype]))
+def filled(text: str, dtype: torch.dtype, width: int | None = None) -> str:
+    """C++ source with the scalar type, the size of a pack (default `CPU_WIDTH`) and the number of Jacobi sweeps."""
+    text = text.replace("CPU_WIDTH", str(width or CPU_WIDTH[dtype])).replace("SWEEPS", str(SWEEPS[dtype]))
     return text.replace("REAL", {torch.float32: "float", torch.float64: "double"}[dtype])
 
 
@@ -43,9 +46,9 @@ def warp_types(dtype: torch.dtype):
     raise TypeError(f"kernels exist for float32 and float64, not {dtype}")
 
 
-def pack_count(n: int, device: torch.device) -> int:
-    """Launch size for n matrices: packs on a CPU, matrices on a GPU."""
-    return -(-n // CPU_WIDTH) if device.type == "cpu" else n
+def pack_count(n: int, device: torch.device, width: int) -> int:
+    """Launch size for n matrices: packs of a width on a CPU, matrices on a GPU."""
+    return -(-n // width) if device.type == "cpu" else n
 
 
 @cache

@@ -199,6 +199,7 @@ class StructuredConstitutive(AdaptableConstitutive):
 
     isotropic = True
     capturable = True
+    native = True
     kernel: tuple[str, kernels.Constants]
     """Kind of the kernel, and the constants of the law."""
 

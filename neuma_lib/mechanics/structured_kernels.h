@@ -1,88 +1,14 @@
-// Kernels of structured_kernels.py for packs of rows, combined with the parts "types" and "svd" of
+// Kernels of structured_kernels.py for packs of rows, combined with the parts "types", "math" and "svd" of
 // singular_values_kernels.h. Letters are those of structured.py.
 
-// Enables fused multiply-add on a CPU, as on a GPU, which is not Warp's default.
-//// begin
-#if defined(__clang__)
-    #pragma clang fp contract(fast)
-#endif
-
-// Keeps the SVD bit-identical to that of singular_values.py.
-//// round_all
-#if defined(__clang__)
-    #pragma clang fp contract(off)
-#endif
-
-// Functions of a pack. On a CPU exp and log are series with an error of one or two units in the last place.
+// Functions of the network.
 //// functions
-    Pack zero;
-    for (int l = 0; l < WIDTH; ++l) LANE(zero, l) = Real(0);
-    const Pack one = zero + Real(1);
 #if defined(__CUDA_ARCH__)
-    #define UNROLL _Pragma("unroll")
     // Forces the weights to be read again, instead of keeping all of them in registers across layers and tiles.
     #define READ_AGAIN asm volatile("" : : : "memory");
-    auto exponential = [](const Pack& x) { return Real(exp(x)); };
-    auto logarithm = [](const Pack& x) { return Real(log(x)); };
-    auto any = [](bool mask) { return mask; };
 #else
-    #define UNROLL
     #define READ_AGAIN
-    typedef INTEGER Bits __attribute__((vector_size(CPU_WIDTH * sizeof(Real))));
-    const int MANTISSA = sizeof(Real) == 4 ? 23 : 52, BIAS = sizeof(Real) == 4 ? 127 : 1023;
-    // Adding 1.5 2^MANTISSA rounds to an integer, which is then in the last bits of the sum
-    const Real ROUND = sizeof(Real) == 4 ? Real(12582912.0) : Real(6755399441055744.0);
-    // log 2 in two parts; products of the first with an exponent are exact
-    const Real LOG2_HIGH = sizeof(Real) == 4 ? Real(0.693359375) : Real(0.693147180369123816490);
-    const Real LOG2_LOW = sizeof(Real) == 4 ? Real(-2.12194440054690583e-4) : Real(1.90821492927058770002e-10);
-    const Real EXP_MIN = sizeof(Real) == 4 ? Real(-87) : Real(-708), EXP_MAX = sizeof(Real) == 4 ? Real(89) : Real(709.9);
-    auto exponential = [&](const Pack& argument) {
-        Pack x = argument > EXP_MAX ? zero + EXP_MAX : argument;
-        x = x < EXP_MIN ? zero + EXP_MIN : x;
-        const Pack shifted = x * Real(1.4426950408889634) + ROUND;
-        const Pack k = shifted - ROUND;
-        const Pack r = (x - k * LOG2_HIGH) - k * LOG2_LOW;
-        Pack series = one;
-        for (int i = EXP_TERMS; i > 0; --i) series = series * r * (Real(1) / Real(i)) + Real(1);
-        return series * (Pack)(((Bits)shifted + BIAS) << MANTISSA);
-    };
-    // for normal numbers
-    auto logarithm = [&](const Pack& x) {
-        const Pack root = zero + Real(0.70710678118654752);
-        const Bits k = ((Bits)x - (Bits)root) >> MANTISSA;
-        const Pack m = (Pack)((Bits)x - (k << MANTISSA));
-        const Pack w = (m - Real(1)) / (m + Real(1));
-        const Pack q = w * w;
-        Pack series = zero + Real(1) / Real(2 * ATANH_TERMS + 1);
-        for (int i = ATANH_TERMS - 1; i >= 0; --i) series = series * q + Real(1) / Real(2 * i + 1);
-        const Pack exponent = (Pack)(k + (Bits)(zero + ROUND)) - ROUND;
-        return exponent * LOG2_HIGH + (Real(2) * w * series + exponent * LOG2_LOW);
-    };
-    auto any = [](const auto& mask) {
-        INTEGER bits = 0;
-        for (int l = 0; l < WIDTH; ++l) bits |= mask[l];
-        return bits != 0;
-    };
 #endif
-    // sinh(x) / x and its derivative, for X = exp(x)
-    auto sinhc = [&](const Pack& x, const Pack& X, Pack& value, Pack& slope) {
-        const Pack q = x * x;
-        Real c[SINH_TERMS + 1];  // 1 / (2 i + 1)!
-        c[0] = Real(1);
-        UNROLL for (int i = 1; i <= SINH_TERMS; ++i) c[i] = c[i - 1] / Real(2 * i * (2 * i + 1));
-        value = q * c[SINH_TERMS] + c[SINH_TERMS - 1];
-        slope = zero + Real(2 * SINH_TERMS) * c[SINH_TERMS];
-        UNROLL for (int i = SINH_TERMS - 1; i > 0; --i) {
-            value = value * q + c[i - 1];
-            slope = slope * q + Real(2 * i) * c[i];
-        }
-        slope = slope * x;
-        const auto far = q > Real(0.25);
-        const Pack safe = far ? x : one, inverse = Real(1) / X;
-        const Pack away = Real(0.5) * (X - inverse) / safe;
-        slope = far ? (Real(0.5) * (X + inverse) - away) / safe : slope;
-        value = far ? away : value;
-    };
     // activation x / sqrt(1 + x^2), with r = 1 / sqrt(1 + x^2) and slope r^3
     auto bend = [](auto& x, auto& r) {
         UNROLL for (int k = 0; k < (int)(sizeof(x) / sizeof(x[0])); ++k) {
@@ -114,8 +40,6 @@
             UNROLL for (int i = 0; i < PART; ++i) x[start + i] = sum[i];
         }
     };
-    auto dot = [](const Pack* x, const Pack* y) { return x[0] * y[0] + x[1] * y[1] + x[2] * y[2]; };
-    const int FIRST[3] = {0, 0, 1}, SECOND[3] = {1, 2, 2}, THIRD[3] = {2, 1, 0};
 
 // Loop over rows: packs on a CPU, tiles of one row per thread on a GPU, where rows past the end repeat the last row
 // without gradient and result.
@@ -155,7 +79,6 @@
                 s[k] = kept[18 + k];
             }
         } else {
-            {ROUND_ALL}
             Pack* const singular = s;
             Pack a[9];
             for (int l = 0; l < WIDTH; ++l) {
@@ -219,23 +142,7 @@
 // Divided differences of max(s, STRETCH_MIN) and of its logarithm over the pairs.
 //// pairs
         Pack clamped[3], log_quotient[3];
-        for (int pair = 0; pair < 3; ++pair) {
-            const int i = FIRST[pair], j = SECOND[pair];
-            const Pack apart = c[i] - c[j], inverse_total = one / (c[i] + c[j]);
-            const Pack w = apart * inverse_total, q = w * w;
-            Pack series = zero + Real(1) / Real(2 * ATANH_TERMS + 1);
-            for (int k = ATANH_TERMS - 1; k >= 0; --k) series = series * q + Real(1) / Real(2 * k + 1);
-            const auto far = q > ATANH_SQUARE;
-            log_quotient[pair] = far ? (e[i] - e[j]) / (far ? apart : one) : Real(2) * inverse_total * series;
-            clamped[pair] = one;
-            if (crushed) {
-                const Pack difference = s[i] - s[j];
-                const auto same = difference == Real(0);
-                const Pack inside = s[j] > STRETCH_MIN ? one : zero;
-                clamped[pair] = same ? inside : apart / (same ? one : difference);
-                log_quotient[pair] = log_quotient[pair] * clamped[pair];
-            }
-        }
+        log_pairs(s, c, e, crushed, clamped, log_quotient);
 
 // Principal stresses y of the form "stretch", with slope = d shear / d s and twist = d shear / d shift.
 //// stretch
@@ -737,7 +644,6 @@
     }
 
 //// end
-    #undef UNROLL
     #undef READ_AGAIN
 
 // Separate kernel on a GPU: a block of LANES times GROUPS threads adds one column per lane of partials (summands, WEIGHTS).

@@ -18,7 +18,17 @@ from neuma_lib.device import native_source
 from neuma_lib.mechanics.elasticity import STRETCH_MIN
 from neuma_lib.mechanics.fused_launch import block_count, contiguous, launch_blocks
 from neuma_lib.mechanics.law import Weights
-from neuma_lib.mechanics.singular_values_kernels import CPU_WIDTH, END, SVD, TYPES, filled, warp_types
+from neuma_lib.mechanics.singular_values_kernels import (
+    CPU_WIDTH,
+    END,
+    FUSE,
+    MATH,
+    SVD,
+    TYPES,
+    filled,
+    pack_count,
+    warp_types,
+)
 
 WIDTH = 16
 INVARIANTS = 3
@@ -59,7 +69,6 @@ def weight_count(kind: str) -> int:
 
 
 def _constants(kind: str, dtype: torch.dtype) -> str:
-    single = dtype == torch.float32
     first = WIDTH * (INVARIANTS + 1)
     integers = {
         "INPUTS": INVARIANTS,
@@ -74,11 +83,6 @@ def _constants(kind: str, dtype: torch.dtype) -> str:
         "GRANULAR": 1,
         "LANES": LANES,
         "GROUPS": GROUPS,
-        # terms for round-off accuracy of exp up to log(2) / 2, atanh(x) / x up to x^2 = ATANH_SQUARE, and sinh(x) / x
-        # up to 1/2
-        "EXP_TERMS": 8 if single else 14,
-        "ATANH_TERMS": 5 if single else 11,
-        "SINH_TERMS": 4 if single else 8,
     }
     reals = {
         "STRETCH_MIN": STRETCH_MIN,
@@ -89,10 +93,6 @@ def _constants(kind: str, dtype: torch.dtype) -> str:
         "COHESION_UNIT": COHESION_UNIT,
         "GROWTH": GROWTH,
         "RISE": LIMIT / math.expm1(GROWTH * LIMIT),
-        "THIRD_PART": 1 / 3,
-        "ATANH_SQUARE": 0.03,
-        "EPS": torch.finfo(dtype).eps,
-        "NORMAL_MIN": torch.finfo(dtype).tiny,
     }
     text = "".join(f"    const int {name} = {value};\n" for name, value in integers.items())
     return text + "".join(f"    const Real {name} = Real({value!r});\n" for name, value in reals.items())
@@ -115,16 +115,14 @@ def source(kind: str, backward: bool, dtype: torch.dtype) -> str:
         body = (*body, "store_gradient", "end_rows", "put_sums")
     else:
         body = ("rows", "decompose", "network", "pairs", "no_gradient", *value, *result, "end_rows")
-    text = parts["begin"] + TYPES + _constants(kind, dtype) + f"    {names}\n" + parts["functions"]
+    text = FUSE + TYPES + _constants(kind, dtype) + MATH + f"    {names}\n" + parts["functions"]
     text += "".join(parts[name] for name in body) + parts["end"] + END
-    single, energy = dtype == torch.float32, kind == "energy"
+    energy = kind == "energy"
     for name, inserted in {
-        "{ROUND_ALL}": parts["round_all"],
         "{SVD}": SVD,
         "{PLUS_B0}": " + b0[k]" if energy else "",
         "{PLUS_B1}": " + b1[k]" if energy else "",
         "{CHOOSE}": "g[k] = changed ? value : g[k];" if kind == "return" else "g[k] = value;",
-        "INTEGER": "int" if single else "long long",
     }.items():
         text = text.replace(name, inserted)
     return filled(text, dtype)
@@ -213,7 +211,9 @@ def _blocks(F: Tensor) -> int:
 
 def new_cache(F: Tensor) -> Tensor | None:
     """Memory (packs, CACHED, CPU_WIDTH) for the SVD of F (n, 3, 3) on a CPU, None on a GPU."""
-    return F.new_empty(-(-len(F) // CPU_WIDTH), CACHED, CPU_WIDTH) if F.device.type == "cpu" else None
+    if F.device.type != "cpu":
+        return None
+    return F.new_empty(pack_count(len(F), F.device, CPU_WIDTH[F.dtype]), CACHED, CPU_WIDTH[F.dtype])
 
 
 @torch.no_grad()

@@ -20,10 +20,39 @@ from neuma_lib.sim.scatter import scatter_functions
 
 
 @functools.cache
+def adjoint_functions(dtype: torch.dtype, clamps: bool) -> SimpleNamespace:
+    """Adjoints of `kernels.forward_functions`."""
+    t, wall_mask = warp_types(dtype), grid_functions(dtype).wall_mask
+    real, vec3, vec4, mat33, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.GridConstants
+
+    @wp.func
+    def deformation_adjoint(c: GridConstants, C_after: mat33, grad_F_trial: mat33):
+        """Gradient of F from F_trial = (I + dt C) F."""
+        return grad_F_trial + c.dt * (wp.transpose(C_after) * grad_F_trial)
+
+    @wp.func
+    def node_adjoint(
+        c: GridConstants, node: wp.int32, grid: wp.array(dtype=vec4), grad_grid: wp.array(dtype=vec4)
+    ):
+        """In place: from the gradient of a node's velocity to those of its momentum and mass."""
+        mv = grid[node]
+        if mv[3] > real(0.0):
+            v = vec3(mv[0], mv[1], mv[2]) / mv[3]
+            g = grad_grid[node]
+            g_mv = wp.cw_mul(vec3(g[0], g[1], g[2]), wall_mask(c, node, v + c.dt * c.gravity)) / mv[3]
+            grad_grid[node] = vec4(g_mv[0], g_mv[1], g_mv[2], -wp.dot(g_mv, v))
+        if wp.static(clamps):
+            if mv[3] < real(0.0):  # a held node
+                grad_grid[node] = vec4()
+
+    return SimpleNamespace(deformation_adjoint=deformation_adjoint, node_adjoint=node_adjoint)
+
+
+@functools.cache
 def adjoint_kernels(
     dtype: torch.dtype, scatter: str = "atomic", features: tuple[str, ...] = ()
 ) -> SimpleNamespace:
-    """Kernels `g2p_adjoint`, `grid_adjoint`, `p2g_adjoint` and `total_adjoint`, see `kernels.forward_kernels`."""
+    """Kernels `g2p_adjoint`, `grid_adjoint` and `p2g_adjoint`, see `kernels.forward_kernels`."""
     contact, clamps = "contact" in features, "clamps" in features
     Hold, held, _ = hold_type(dtype), *vars(clamp_functions(dtype)).values()
     t, functions = warp_types(dtype), grid_functions(dtype)
@@ -33,8 +62,8 @@ def adjoint_kernels(
     run_of, deposit = scatter_functions(dtype, scatter, 3)
     real, vec3, vec4, mat33, mat34, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.mat34, t.GridConstants
     stencil, slopes, moments = functions.stencil, functions.slopes, functions.moments
-    column, wall_mask, moved_mask = functions.column, functions.wall_mask, functions.moved_mask
-    obstacle_row = functions.obstacle_row
+    column, moved_mask, obstacle_row = functions.column, functions.moved_mask, functions.obstacle_row
+    deformation_adjoint, node_adjoint = vars(adjoint_functions(dtype, clamps)).values()
     gather, three_nodes = gather_functions(dtype)
     module = f"neuma_lib.sim.adjoint_{str(dtype).removeprefix('torch.')}_{'_'.join((scatter, *features))}"
     kernel = functools.partial(wp.kernel, enable_backward=False, module=module)
@@ -74,7 +103,7 @@ def adjoint_kernels(
         # gradients of C, F and v from F_trial = (I + dt C) F and x = x + dt v
         g_trial = grad_F_trial[p]
         if alive:
-            grad_F[p] = g_trial + c.dt * (wp.transpose(C[after, p]) * g_trial)
+            grad_F[p] = deformation_adjoint(c, C[after, p], g_trial)
         g_C = grad_C[p] + c.dt * (g_trial * wp.transpose(F[now, p]))
         g_x = wp.cw_mul(moved_mask(c, x[after, p]), grad_x[p])
         g_v = grad_v[p] + c.dt * g_x
@@ -112,20 +141,12 @@ def adjoint_kernels(
         grid: wp.array2d(dtype=vec4),
         grad_grid: wp.array2d(dtype=vec4),
     ):
-        """In place: from the gradient of a node's velocity to those of its momentum and mass.
+        """Gradients of the nodes in place (`adjoint_functions`).
 
         Clears the other side of `grad_grid` for the previous step.
         """
         node = wp.tid()
-        mv = grid[cached, node]
-        if mv[3] > real(0.0):
-            v = vec3(mv[0], mv[1], mv[2]) / mv[3]
-            g = grad_grid[side, node]
-            g_mv = wp.cw_mul(vec3(g[0], g[1], g[2]), wall_mask(c, node, v + c.dt * c.gravity)) / mv[3]
-            grad_grid[side, node] = vec4(g_mv[0], g_mv[1], g_mv[2], -wp.dot(g_mv, v))
-        if wp.static(clamps):
-            if mv[3] < real(0.0):  # a held node
-                grad_grid[side, node] = vec4()
+        node_adjoint(c, node, grid[cached], grad_grid[side])
         grad_grid[1 - side, node] = vec4()
 
     @kernel
@@ -218,25 +239,8 @@ def adjoint_kernels(
         grad_tau[p] = -stress * g_A
         grad_x[p] = grad_x[p] + c.inv_dx * (moving - wp.transpose(A) * g)
 
-    @kernel
-    def total_adjoint(
-        c: GridConstants,
-        now: wp.int32,
-        after: wp.int32,
-        C: wp.array2d(dtype=mat33),
-        F_total: wp.array2d(dtype=mat33),
-        grad_C: wp.array(dtype=mat33),
-        grad_F_total: wp.array(dtype=mat33),
-    ):
-        """In place: from the gradient of F_total after the step to those of C (added) and of F_total before it."""
-        p = wp.tid()
-        g = grad_F_total[p]
-        grad_C[p] = grad_C[p] + c.dt * (g * wp.transpose(F_total[now, p]))
-        grad_F_total[p] = g + c.dt * (wp.transpose(C[after, p]) * g)
-
     return SimpleNamespace(
         g2p_adjoint=g2p_adjoint,
         grid_adjoint=grid_adjoint,
         p2g_adjoint=p2g_adjoint,
-        total_adjoint=total_adjoint,
     )

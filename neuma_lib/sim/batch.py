@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import torch
 
 from neuma_lib.errors import InputError, NonFiniteError
-from neuma_lib.mechanics.analytic_fused import fusible, side_by_side
 from neuma_lib.mechanics.law import Law
+from neuma_lib.mechanics.side_by_side import fusible, side_by_side
 from neuma_lib.sim.model import MPM, MaterialRegion
 from neuma_lib.sim.rollout import check_inside, checked_frames, fly_and_simulate
 from neuma_lib.sim.state import State, Trajectory
@@ -31,7 +31,7 @@ def rollout_batch(
 ) -> list[Trajectory | None]:
     """`rollout` for each of several laws, equal to round-off, without gradients and in fewer launches.
 
-    Analytic laws with kernels (`analytic_fused`) are evaluated in one launch for any kinds and constants. Other laws
+    Analytic laws with kernels (`analytic_kernels`) are evaluated in one launch for any kinds and constants. Other laws
     share only the transfers.
 
     Args:

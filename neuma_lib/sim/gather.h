@@ -1,16 +1,9 @@
 // Functions of gather.py. REAL is the scalar type, VECTOR whether a GPU loads a node in one instruction.
 //// node
     typedef REAL Real;
-    // A node is one vector register on a CPU. Otherwise the compiler loads its numbers one by one.
-#if defined(__CUDA_ARCH__)
     struct alignas(16) Node { Real c[4]; };
     #define EACH for (int a = 0; a < 4; ++a)
     #define OF(x) (x).c[a]
-#else
-    typedef Real Node __attribute__((vector_size(4 * sizeof(Real)), aligned(sizeof(Real))));
-    #define EACH
-    #define OF(x) (x)
-#endif
     // On a GPU the compiler loads single numbers if the fourth is not used. The load is not volatile, because kernels
     // that read these nodes do not write them.
     auto load = [](const Node* place) {

@@ -185,11 +185,103 @@ def grid_functions(dtype: torch.dtype) -> SimpleNamespace:
 
 
 @functools.cache
+def forward_functions(dtype: torch.dtype, clamps: bool) -> SimpleNamespace:
+    """Parts of the forward kernels that are the same on every device: for a held particle, a node, and a particle."""
+    t, functions = warp_types(dtype), grid_functions(dtype)
+    Hold, (_, prescribed) = hold_type(dtype), vars(clamp_functions(dtype)).values()
+    real, vec3, vec4, mat33, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.GridConstants
+    copy_of, stencil = functions.copy_of, functions.stencil
+    wall_mask, moved = functions.wall_mask, functions.moved
+
+    @wp.func
+    def hold_mass(
+        c: GridConstants,
+        p: wp.int32,
+        x: vec3,
+        m: real,
+        clamp: wp.int32,
+        held_mass: wp.array(dtype=real),
+        held_by: wp.array(dtype=wp.int32),
+    ):
+        """Add the mass of a clamped particle to the clamped mass of its nodes."""
+        first, _, wi, wj, wk = stencil(c, p, x)
+        for node in range(27):
+            i, j, k = node / 9, node / 3 % 3, node % 3
+            here = first + (i * c.n + j) * c.n + k
+            wp.atomic_add(held_mass, here, wi[i] * wj[j] * wk[k] * m)
+            wp.atomic_max(held_by, here, clamp)
+
+    @wp.func
+    def update_node(
+        c: GridConstants,
+        pose: wp.int32,
+        node: wp.int32,
+        grid: wp.array(dtype=vec4),
+        grid_v: wp.array(dtype=vec4),
+        holds: wp.array2d(dtype=Hold),
+        held_mass: wp.array(dtype=real),
+        held_by: wp.array(dtype=wp.int32),
+    ):
+        """v_i = (m v)_i / m_i + dt g where there is mass, then the boundary conditions.
+
+        Held nodes move with their clamp. Their mass becomes -1, so that `grid_adjoint` knows them.
+        """
+        mv = grid[node]
+        result = vec4()
+        if mv[3] > real(0.0):
+            v = vec3(mv[0], mv[1], mv[2]) / mv[3] + c.dt * c.gravity
+            v = wp.cw_mul(v, wall_mask(c, node, v))
+            result = vec4(v[0], v[1], v[2], real(1.0))
+        if wp.static(clamps):
+            m = held_mass[node]
+            if m > real(wp.static(HELD_SHARE)) * (m + mv[3]):
+                place = vec3(real(node / (c.n * c.n) % c.n), real(node / c.n % c.n), real(node % c.n))
+                u = prescribed(holds[pose, held_by[node]], c.dx * (place + vec3(c.first)))
+                result = vec4(u[0], u[1], u[2], real(1.0))
+                grid[node] = vec4(real(0.0), real(0.0), real(0.0), real(-1.0))
+        grid_v[node] = result
+
+    @wp.func
+    def move_particle(
+        c: GridConstants,
+        now: wp.int32,
+        after: wp.int32,
+        cached: wp.int32,
+        step: wp.int32,
+        p: wp.int32,
+        v_new: vec3,
+        C_new: mat33,
+        x: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        C: wp.array2d(dtype=mat33),
+        F: wp.array2d(dtype=mat33),
+        F_trial: wp.array2d(dtype=mat33),
+        faults: wp.array2d(dtype=wp.int64),
+    ):
+        """Set the state of a particle after the step, and flag its faults."""
+        x_new = moved(c, x[now, p], v_new)
+        x[after, p] = x_new
+        v[after, p] = v_new
+        C[after, p] = C_new
+        F_trial[cached, p] = F[now, p] + c.dt * (C_new * F[now, p])
+        # Faults keep the first (step, particle). Velocities are checked because clamping hides errors of positions.
+        copy, here = copy_of(c, p), wp.int64(step) * wp.int64(2147483648) + wp.int64(p)
+        if not (wp.isfinite(v_new) and wp.isfinite(C_new)):
+            wp.atomic_min(faults, copy, 0, here)
+        elif c.dt * wp.max(wp.abs(v_new)) > c.dx:
+            wp.atomic_min(faults, copy, 1, here)
+        elif wp.min(x_new) < c.leave_low or wp.max(x_new) > c.leave_high:
+            wp.atomic_min(faults, copy, 2, here)
+
+    return SimpleNamespace(hold_mass=hold_mass, update_node=update_node, move_particle=move_particle)
+
+
+@functools.cache
 def forward_kernels(
     dtype: torch.dtype, scatter: str = "atomic", features: tuple[str, ...] = ()
 ) -> SimpleNamespace:
-    """Kernels `cells`, `p2g`, `grid_update`, `g2p`, `trial_deformation` and `advect_tracers` for a precision, a
-    scatter method and features of the model: "contact" of particles, "meshes" that they touch, and "clamps"."""
+    """Kernels `cells`, `p2g`, `grid_update` and `g2p` for a precision, a scatter method and features of the model:
+    "contact" of particles, "meshes" that they touch, and "clamps"."""
     contact, clamps = "contact" in features, "clamps" in features
     Hold, held, prescribed = hold_type(dtype), *vars(clamp_functions(dtype)).values()
     t, functions = warp_types(dtype), grid_functions(dtype)
@@ -197,9 +289,9 @@ def forward_kernels(
     ordered = scatter != "atomic"
     run_of, deposit = scatter_functions(dtype, scatter, 4)
     real, vec3, vec4, mat33, mat34, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.mat34, t.GridConstants
-    copy_of, stencil, moments = functions.copy_of, functions.stencil, functions.moments
-    column, wall_mask, moved = functions.column, functions.wall_mask, functions.moved
+    stencil, moments, column = functions.stencil, functions.moments, functions.column
     obstacle_row = functions.obstacle_row
+    hold_mass, update_node, move_particle = vars(forward_functions(dtype, clamps)).values()
     gather, _ = gather_functions(dtype)
     module = f"neuma_lib.sim.forward_{str(dtype).removeprefix('torch.')}_{'_'.join((scatter, *features))}"
     kernel = functools.partial(wp.kernel, enable_backward=False, module=module)
@@ -251,12 +343,8 @@ def forward_kernels(
         r = radius[p]
         if wp.static(clamps):
             if held(holds, pose, clamp[p]):
-                for node in range(27):
-                    i, j, k = node / 9, node / 3 % 3, node % 3
-                    here = first + (i * c.n + j) * c.n + k
-                    if alive:
-                        wp.atomic_add(held_mass, here, wi[i] * wj[j] * wk[k] * m)
-                        wp.atomic_max(held_by, here, clamp[p])
+                if alive:
+                    hold_mass(c, p, x[now, p], m, clamp[p], held_mass, held_by)
                 m = real(0.0)
                 vol = real(0.0)
                 r = real(wp.static(NO_CONTACT))
@@ -291,25 +379,8 @@ def forward_kernels(
         held_mass: wp.array(dtype=real),
         held_by: wp.array(dtype=wp.int32),
     ):
-        """v_i = (m v)_i / m_i + dt g where there is mass, then the boundary conditions.
-
-        Held nodes move with their clamp. Their mass becomes -1, so that `grid_adjoint` knows them.
-        """
-        node = wp.tid()
-        mv = grid[cached, node]
-        result = vec4()
-        if mv[3] > real(0.0):
-            v = vec3(mv[0], mv[1], mv[2]) / mv[3] + c.dt * c.gravity
-            v = wp.cw_mul(v, wall_mask(c, node, v))
-            result = vec4(v[0], v[1], v[2], real(1.0))
-        if wp.static(clamps):
-            m = held_mass[node]
-            if m > real(wp.static(HELD_SHARE)) * (m + mv[3]):
-                place = vec3(real(node / (c.n * c.n) % c.n), real(node / c.n % c.n), real(node % c.n))
-                u = prescribed(holds[pose, held_by[node]], c.dx * (place + vec3(c.first)))
-                result = vec4(u[0], u[1], u[2], real(1.0))
-                grid[cached, node] = vec4(real(0.0), real(0.0), real(0.0), real(-1.0))
-        grid_v[cached, node] = result
+        """Velocities of the nodes (`forward_functions`)."""
+        update_node(c, pose, wp.tid(), grid[cached], grid_v[cached], holds, held_mass, held_by)
 
     @kernel
     def g2p(
@@ -347,19 +418,24 @@ def forward_kernels(
             if held(holds, pose, clamp[p]):
                 v_new = prescribed(holds[pose, clamp[p]], xp)
                 C_new = holds[pose, clamp[p]].A
-        x_new = moved(c, xp, v_new)
-        x[after, p] = x_new
-        v[after, p] = v_new
-        C[after, p] = C_new
-        F_trial[cached, p] = F[now, p] + c.dt * (C_new * F[now, p])
-        # Faults keep the first (step, particle). Velocities are checked because clamping hides errors of positions.
-        copy, here = copy_of(c, p), wp.int64(step) * wp.int64(2147483648) + wp.int64(p)
-        if not (wp.isfinite(v_new) and wp.isfinite(C_new)):
-            wp.atomic_min(faults, copy, 0, here)
-        elif c.dt * wp.max(wp.abs(v_new)) > c.dx:
-            wp.atomic_min(faults, copy, 1, here)
-        elif wp.min(x_new) < c.leave_low or wp.max(x_new) > c.leave_high:
-            wp.atomic_min(faults, copy, 2, here)
+        move_particle(c, now, after, cached, step, p, v_new, C_new, x, v, C, F, F_trial, faults)
+
+    return SimpleNamespace(
+        cells=cells,
+        p2g=p2g,
+        grid_update=grid_update,
+        g2p=g2p,
+    )
+
+
+@functools.cache
+def deformation_kernels(dtype: torch.dtype) -> SimpleNamespace:
+    """Kernels `trial_deformation`, `total_adjoint` and `advect_tracers` for a precision."""
+    t, functions = warp_types(dtype), grid_functions(dtype)
+    real, vec3, vec4, mat33, mat34, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.mat34, t.GridConstants
+    stencil, moved = functions.stencil, functions.moved
+    module = f"neuma_lib.sim.deformation_{str(dtype).removeprefix('torch.')}"
+    kernel = functools.partial(wp.kernel, enable_backward=False, module=module)
 
     @kernel
     def trial_deformation(
@@ -393,11 +469,22 @@ def forward_kernels(
         if total[3] > real(0.0):
             x[p] = moved(c, xp, vec3(total[0], total[1], total[2]) / total[3])
 
+    @kernel
+    def total_adjoint(
+        c: GridConstants,
+        now: wp.int32,
+        after: wp.int32,
+        C: wp.array2d(dtype=mat33),
+        F_total: wp.array2d(dtype=mat33),
+        grad_C: wp.array(dtype=mat33),
+        grad_F_total: wp.array(dtype=mat33),
+    ):
+        """In place: from the gradient of F_total after the step to those of C (added) and of F_total before it."""
+        p = wp.tid()
+        g = grad_F_total[p]
+        grad_C[p] = grad_C[p] + c.dt * (g * wp.transpose(F_total[now, p]))
+        grad_F_total[p] = g + c.dt * (wp.transpose(C[after, p]) * g)
+
     return SimpleNamespace(
-        cells=cells,
-        p2g=p2g,
-        grid_update=grid_update,
-        g2p=g2p,
-        trial_deformation=trial_deformation,
-        advect_tracers=advect_tracers,
+        trial_deformation=trial_deformation, total_adjoint=total_adjoint, advect_tracers=advect_tracers
     )

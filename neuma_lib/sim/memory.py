@@ -15,6 +15,7 @@ _TOTAL_FLOATS = 9  # F_total of a particle
 _CONTACT_FLOATS = 3  # tangential displacement of a particle in contact
 _STEP_FLOATS = 18  # tau, F_trial of a particle
 _NODE_FLOATS = 8  # grid, grid_v of a node
+_REUSED_NODE_FLOATS = 12  # grid, grid_v and grad_grid of a node, if steps share them
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,8 @@ class MemoryPlan:
     Attributes:
         segment: number of consecutive steps whose states are in memory. If there are several segments, the state
             before each is kept as a checkpoint, and the reverse loop recomputes a segment from it.
-        caches_steps: whether stresses and grids of these steps are kept in addition to their states.
+        caches_steps: whether stresses, trial deformations and perhaps grids of these steps are kept in addition to
+            their states.
         law_cache_bytes: memory left for the caches of the laws.
     """
 
@@ -42,6 +44,7 @@ def plan_memory(
     memory: float | None = None,
     total: bool = False,
     contact: bool = False,
+    keeps_grids: bool = True,
 ) -> MemoryPlan:
     """The fastest plan that fits into memory.
 
@@ -52,13 +55,15 @@ def plan_memory(
         memory: maximum bytes for states and intermediate values together; None does not limit the states.
         total: whether states include the total deformation.
         contact: whether states include the tangential displacement of contact of particles.
+        keeps_grids: whether the grids of a step belong to its intermediate values. If not, all steps share them.
 
     Raises:
         InputError: segments of a single step do not fit into `memory`.
     """
     state = itemsize * (_STATE_FLOATS + total * _TOTAL_FLOATS + contact * _CONTACT_FLOATS) * particles
-    step = itemsize * (_STEP_FLOATS * particles + _NODE_FLOATS * nodes)
-    whole = state * (steps + 1) + step
+    step = itemsize * (_STEP_FLOATS * particles + keeps_grids * _NODE_FLOATS * nodes)
+    shared = 0 if keeps_grids else itemsize * _REUSED_NODE_FLOATS * nodes
+    whole = state * (steps + 1) + step + shared
     if memory is None or whole <= memory:
         if memory is not None:
             cache_bytes = min(cache_bytes, memory - whole)
@@ -69,9 +74,8 @@ def plan_memory(
     needed = whole
     for caches_steps in (True, False) if cache_bytes else (False,):
         for segment in range(steps, 0, -1):
-            size = state * (segment + 1 + math.ceil(steps / segment)) + step * (
-                segment if caches_steps else 1
-            )
+            states = segment + 1 + math.ceil(steps / segment)
+            size = state * states + step * (segment if caches_steps else 1) + shared
             if size <= memory:
                 return MemoryPlan(segment, caches_steps, 0)
             needed = min(needed, size)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import accumulate
 
 import torch
@@ -92,7 +93,7 @@ class MPM:
         if self.contact != "particles" and self.colliders:
             raise InputError("colliders", f"need contact of particles, not of {self.contact}")
 
-    @property
+    @cached_property
     def obstacles(self) -> tuple[Collider, ...]:
         """Colliders of contact of particles: the six faces of the cube in the order of `WALLS`, then the others."""
         if self.contact != "particles":
@@ -101,12 +102,12 @@ class MPM:
         frictions = [_FRICTION[own] if isinstance(own, str) else own for own in conditions]
         return (*unit_cube(frictions), *self.colliders)
 
-    @property
+    @cached_property
     def frictions(self) -> tuple[float, ...]:
         """Coulomb coefficients of the obstacles."""
         return tuple(obstacle.friction for obstacle in self.obstacles)
 
-    @property
+    @cached_property
     def frictionless(self) -> MPM:
         """The same model for all models that differ only in `frictions`."""
         return self.with_friction(0.0) if self.contact == "particles" else self

@@ -20,6 +20,7 @@ from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.free_flight import ballistic, free_flight_steps
 from neuma_lib.sim.memory import DEFAULT_CACHE_BYTES, plan_memory
 from neuma_lib.sim.model import MPM, MaterialRegion, as_regions
+from neuma_lib.sim.scatter import scatter_for
 from neuma_lib.sim.simulation import Simulation, gather_weights
 from neuma_lib.sim.state import State, Trajectory
 
@@ -96,6 +97,12 @@ def _warn_of_another_grid(name: str, learned: int, used: int) -> None:
     )
 
 
+@cache
+def _log_evaluation(law: str, native: bool) -> None:
+    """Log once how a law is evaluated."""
+    _LOGGER.info("%s is evaluated by %s", law, "native kernels" if native else "torch, which is slower")
+
+
 def simulate(
     mpm: MPM,
     law: Law | Sequence[MaterialRegion],
@@ -155,6 +162,10 @@ def fly_and_simulate(
     Returns one error per copy, or None. The states of a copy with an error are undefined. If all copies have one, the
     first is raised.
     """
+    for region in regions:
+        for part in (region.law.elasticity, region.law.plasticity):
+            for own in getattr(part, "parts", (part,)):
+                _log_evaluation(type(own).__name__, own.native)
     first = free_flight_steps(model, regions, state, frames[-1], copies) if skip_free_flight else 0
     more = {"F_total": state.F} if total else {}
     if model.contact == "particles":
@@ -170,12 +181,15 @@ def fly_and_simulate(
         start = (landed.x[0], landed.v[0], *start[2:])
         tracers = None if landed.tracers is None else landed.tracers[0]
     x, steps, plan = state.x, frames[-1] - first, None
+    scatter = scatter or scatter_for(x.device, x.dtype)
     weights, slices = gather_weights(regions, x.dtype)
     inputs = (*start, *weights)
     if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
         cache_bytes = DEFAULT_CACHE_BYTES[x.device.type] if cache_bytes is None else cache_bytes
         nodes, contact = copies * model.nodes**3, model.contact == "particles"
-        plan = plan_memory(steps, len(x), nodes, x.element_size(), cache_bytes, memory, total, contact)
+        plan = plan_memory(
+            steps, len(x), nodes, x.element_size(), cache_bytes, memory, total, contact, scatter != "native"
+        )
     simulation = Simulation(
         model, regions, slices, state, steps, first, plan, scatter, total, copies, frictions
     )

@@ -1,8 +1,9 @@
 """Scatter from particles to grid nodes, which dominates the time of the transfers on a GPU.
 
-The 27 contributions of a particle overlap with those of its neighbours and are added atomically. There are two methods:
+The 27 contributions of a particle overlap with those of its neighbours. There are three methods:
 
-- "atomic": every particle adds each of its numbers, for both precisions, on CPU and GPU.
+- "native" (CPU): one thread adds them in the order of the particles, see `transfers`. All transfers differ with it.
+- "atomic": every particle adds each of its numbers atomically, for both precisions, on CPU and GPU.
 - "runs" (CUDA, float32): threads process particles sorted by cell, so that neighbours in a warp mostly share their 27
   nodes. The warp sums the contributions of each run of equal cells with shuffles, and the first thread of the run adds
   the sum, by whole nodes (16 bytes) on compute capability 9.0 or by single numbers. "runs_scalar" always adds single
@@ -22,7 +23,9 @@ start_warp()
 
 def scatter_for(device: torch.device, dtype: torch.dtype) -> str:
     """The fastest scatter method for a device and precision."""
-    return "runs" if device.type == "cuda" and dtype == torch.float32 else "atomic"
+    if device.type == "cpu":
+        return "native"
+    return "runs" if dtype == torch.float32 else "atomic"
 
 
 @functools.cache

@@ -24,6 +24,8 @@ from neuma_lib.sim.kernels import NO_FAULT
 from neuma_lib.sim.memory import MemoryPlan
 from neuma_lib.sim.model import MPM, MaterialRegion, law_weights
 from neuma_lib.sim.scatter import scatter_for
+from neuma_lib.sim.segment_loop import SegmentLoop
+from neuma_lib.sim.sequence import Repeated
 from neuma_lib.sim.state import State
 from neuma_lib.sim.workspace import Workspace, WorkspaceSize, pooled_workspace
 
@@ -106,6 +108,8 @@ class Simulation:
         self._weight_slices = weight_slices
         laws = [getattr(region.law, part) for region in regions for part in PARTS]
         self._uses_graphs = x.device.type == "cuda" and all(law.capturable for law in laws)
+        self._loops = self.workspace.native and all(law.native_rows for law in laws)
+        self._loop: SegmentLoop | None = None
         self.errors: list[NonFiniteError | None] = [None] * copies
         self._graph_key = tuple((b.start, b.stop) for b in regions), tuple(law.graph_key() for law in laws)
 
@@ -130,6 +134,7 @@ class Simulation:
             ws.load_weights(weights)
             weights = ws.weights
         passive = None if tracers is None else _Tracers(ws, tracers, frames)
+        self._make_loop(weights, None if passive is None else passive.repeated)
         faults = ws.faults.clone()
         self._copy_frames(0, [0], frames, result)
         last = 0  # index of the last state of the previous segment
@@ -143,7 +148,7 @@ class Simulation:
             if passive is None:
                 self._launch(("forward", steps), lambda steps=steps: self._advance(steps, weights))
             else:
-                self._advance(steps, weights, lambda n, first=first: passive.move(n, first))
+                self._advance(steps, weights, passive, first)
             last, self._segment_in_memory = ws.at(steps), index
             self._copy_frames(first, range(1, steps + 1) if self.plan else [steps], frames, result)
             shifted = torch.where(ws.faults < NO_FAULT, ws.faults + (first << 31), ws.faults)
@@ -152,6 +157,8 @@ class Simulation:
             # This check would synchronise a GPU.
             if ws.size.device.type == "cpu" and (faults < NO_FAULT).any(dim=1).all():
                 break
+        if passive is not None:
+            self._make_loop(weights, None)  # segments that are computed again do not move them
         self._find_errors(faults, result[2][-1])
         return *result, None if passive is None else passive.seen
 
@@ -211,8 +218,9 @@ class Simulation:
         F, F_trial = ws.F[ws.at(n)], ws.F_trial[cached]
         if not self.plan.caches_steps:
             self._evaluate("elasticity", n, F, weights, ws.tau[cached], fill_cache=True)
-            ws.transfer_to_grid(n)
             ws.trial_deformation(n)
+        if not self.plan.caches_steps or ws.native:
+            ws.transfer_to_grid(n)
         self._vjp("plasticity", n, F_trial, weights, ws.grad_F, ws.grad_F_trial, sums)
         ws.transfer_adjoint(n)
         self._vjp("elasticity", n, F, weights, ws.grad_tau, ws.grad_F_elastic, sums)
@@ -233,15 +241,35 @@ class Simulation:
         else:
             launches()
 
+    def _make_loop(self, weights: Sequence[Tensor], tracers: Repeated | None) -> None:
+        """Build the loop over the steps of a segment if all laws have kernels on a CPU."""
+        if self._loops:
+            parts = {
+                part: [(law, here, tuple(weights[own])) for law, here, own, _ in self._laws(part, 0)]
+                for part in PARTS
+            }
+            caches_steps = self.plan is not None and self.plan.caches_steps
+            self._loop = SegmentLoop(self.workspace, parts, caches_steps, self._law_cache_bytes, tracers)
+
     def _advance(
-        self, steps: int, weights: Sequence[Tensor], after_step: Callable[[int], None] | None = None
+        self, steps: int, weights: Sequence[Tensor], passive: _Tracers | None = None, first: int = 0
     ) -> None:
-        """Run all steps of a segment."""
+        """Run all steps of a segment, which starts at step `first`, and move the tracers."""
+        if self._loop:
+            stops = [*(n - first for n in passive.frames_after(first, steps)), steps] if passive else [steps]
+            n = 0
+            for stop in stops:
+                self._loop.advance(n, stop - n)
+                n = stop
+                if passive:
+                    passive.store(first + n)
+            return
         with self.workspace.stream():
             for n in range(steps):
                 self.step(n, weights)
-                if after_step:
-                    after_step(n)
+                if passive:
+                    passive.move(n)
+                    passive.store(first + n + 1)
 
     def _reverse(
         self,
@@ -255,7 +283,8 @@ class Simulation:
         ws = self.workspace
         totals = ws.grad_states
         frame_of = {n: index for index, n in enumerate(at)}
-        ws.grad_grid.zero_()
+        if not ws.native:
+            ws.grad_grid.zero_()
         with ws.stream():
             sums = {
                 part: [
@@ -264,15 +293,26 @@ class Simulation:
                 ]
                 for part in PARTS
             }
-            for n in range(steps, 0, -1):
+            if self._loop:
+                self._loop.start_reverse()
+            n = steps
+            while n > 0:
                 if n in frame_of:
                     for total, grad in zip(totals, added, strict=True):
                         if grad is not None:
                             total.add_(grad[frame_of[n]])
-                self.step_adjoint(n - 1, weights, sums)
+                before = max([m for m in at if m < n], default=0) if self._loop else n - 1
+                if self._loop:
+                    self._loop.reverse(n - 1, n - before)
+                else:
+                    self.step_adjoint(before, weights, sums)
+                n = before
             for part in PARTS:
+                for k, (_, _, own, _) in enumerate(self._laws(part, 0) if self._loop else ()):
+                    if weights[own]:
+                        sums[part][k][0][:, 1:] += self._loop.grad_rows(part, k)
                 for (law, _, own, _), received in zip(self._laws(part, 0), sums[part], strict=True):
-                    law.add_up(received, tuple(grad_weights[own]))
+                    law.add_up(received, tuple(weights[own]), tuple(grad_weights[own]))
 
     def _copy_frames(
         self, first: int, steps: Sequence[int], frames: Sequence[int], result: Sequence[Tensor]
@@ -345,6 +385,8 @@ class Simulation:
                 particle = int((~torch.isfinite(own).flatten(1).all(dim=1)).nonzero()[0])
                 flags[0] = (self.steps - 1) << 31 | copy * len(own) + particle
             self.errors.append(self._error(*flags))
+        if any(self.errors):
+            self.workspace.clear_grids()
         if all(self.errors):
             raise self.errors[0]
 
@@ -380,15 +422,20 @@ class _Tracers:
         self._ws, self._frame_of = ws, {n: index for index, n in enumerate(frames)}
         self._x = tracers.detach().clone(memory_format=torch.contiguous_format)
         self._launch = ws.tracer_launch(self._x)
+        self.repeated = Repeated(self._launch)
         self.seen = self._x.new_empty(len(frames), *self._x.shape)
-        self._store(0)
+        self.store(0)
 
-    def move(self, n: int, first: int) -> None:
-        """Move with the nodes of step n of the segment that starts at step `first`."""
+    def move(self, n: int) -> None:
+        """Move with the nodes of step n of the segment."""
         self._ws.move_tracers(self._launch, n)
-        self._store(first + n + 1)
 
-    def _store(self, step: int) -> None:
+    def frames_after(self, first: int, steps: int) -> list[int]:
+        """Frames inside the segment of some steps from `first` on."""
+        return [n for n in self._frame_of if first < n < first + steps]
+
+    def store(self, step: int) -> None:
+        """Keep the positions after a step if it is a frame."""
         if step in self._frame_of:
             self.seen[self._frame_of[step]].copy_(self._x)
 

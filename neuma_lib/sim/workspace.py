@@ -23,8 +23,9 @@ from neuma_lib.sim.clamp_kernels import hold_type, holds
 from neuma_lib.sim.colliders import contact_radius
 from neuma_lib.sim.contact_kernels import STICKING, distances, obstacle_type, obstacles
 from neuma_lib.sim.graphs import MAX_GRAPHS, GraphCache
-from neuma_lib.sim.kernels import NO_FAULT, forward_kernels, warp_types
+from neuma_lib.sim.kernels import NO_FAULT, deformation_kernels, forward_kernels, warp_types
 from neuma_lib.sim.model import MPM, WALLS
+from neuma_lib.sim.native import NativeTransfers
 
 SORT_EVERY = 16
 """Steps between sorts of the particles by cell, for scatter methods that need it."""
@@ -88,6 +89,7 @@ class Workspace:
         law_caches: caches of the laws, kept here so that the next rollout can overwrite them.
         weights, grad_weights: weights of the laws and their gradients at fixed addresses, for the graphs.
         graphs: recorded loops over these buffers.
+        native: the transfers of a CPU, or None. Its steps share a grid, and gradients of the nodes have one side.
     """
 
     def __init__(self, size: WorkspaceSize):
@@ -100,18 +102,25 @@ class Workspace:
         self._frame_grads: dict[Hashable, list[Tensor | None]] = {}
         N, nodes = size.particles, self._node_count
         states, cached = size.n_states, size.n_cached_steps
-        self.x, self.v = self._buffer((states, N), "vec3"), self._buffer((states, N), "vec3")
-        self.C, self.F = self._buffer((states, N), "mat33"), self._buffer((states, N), "mat33")
+        self.x, self.v = self.buffer((states, N), "vec3"), self.buffer((states, N), "vec3")
+        self.C, self.F = self.buffer((states, N), "mat33"), self.buffer((states, N), "mat33")
         self.states = (self.x, self.v, self.F, self.C)
         if size.total:
-            self.F_total = self._buffer((states, N), "mat33")
+            self.F_total = self.buffer((states, N), "mat33")
             self.states += (self.F_total,)
-        self.stuck = self._buffer((states, N) if self._contact else (1, 1), "vec3")
+        self.stuck = self.buffer((states, N) if self._contact else (1, 1), "vec3")
         if self._contact:
             self.states += (self.stuck,)
-        self.tau, self.F_trial = self._buffer((cached, N), "mat33"), self._buffer((cached, N), "mat33")
-        self.grid, self.grid_v = self._buffer((cached, nodes), "vec4"), self._buffer((cached, nodes), "vec4")
-        self.mass, self.vol0, self.radius = (self._buffer((N,), "real") for _ in range(3))
+        self.tau, self.F_trial = self.buffer((cached, N), "mat33"), self.buffer((cached, N), "mat33")
+        self.mass, self.vol0, self.radius = (self.buffer((N,), "real") for _ in range(3))
+        self.native = NativeTransfers(self) if size.scatter == "native" else None
+        if self.native:
+            self.grid, self.grid_v, *_ = self.native.grids[:, None, :nodes]
+        else:
+            self.grid, self.grid_v = (
+                self.buffer((cached, nodes), "vec4"),
+                self.buffer((cached, nodes), "vec4"),
+            )
         self.frictions = np.zeros((size.copies, len(size.model.obstacles)))
         self.obstacles = self._obstacles([0.0] * size.n_poses)
         self.distances = wp.array(
@@ -120,33 +129,40 @@ class Workspace:
             device=wp.device_from_torch(size.device),
         )
         self.holds = self._holds([0.0] * size.n_poses)
-        self.clamp = self._buffer((N if size.model.clamps else 1,), dtype=torch.int32)
+        self.clamp = self.buffer((N if size.model.clamps else 1,), dtype=torch.int32)
         held = nodes if size.model.clamps else 1
-        self.held_mass, self.held_by = self._buffer((held,), "real"), self._buffer((held,), dtype=torch.int32)
-        self.faults = self._buffer((size.copies, 3), dtype=torch.int64)
+        self.held_mass, self.held_by = self.buffer((held,), "real"), self.buffer((held,), dtype=torch.int32)
+        self.faults = self.buffer((size.copies, 3), dtype=torch.int64)
         self.checkpoints = tuple(
             value.new_empty(size.n_checkpoints, *value.shape[1:]) for value in self.states
         )
-        self.sorts = size.scatter != "atomic"
+        self.sorts = size.scatter not in ("native", "atomic")
         n_sorts = -(-max(states - 1, 1) // SORT_EVERY) if self.sorts and size.differentiable else 1
-        self.order = self._buffer((n_sorts, N if self.sorts else 1), dtype=torch.int32)
-        self.cells = self._buffer((N if self.sorts else 1,), dtype=torch.int32)
+        self.order = self.buffer((n_sorts, N if self.sorts else 1), dtype=torch.int32)
+        self.cells = self.buffer((N if self.sorts else 1,), dtype=torch.int32)
         self._constants = _grid_constants(size)
-        self._record_forward()
+        self._deformation = deformation_kernels(size.dtype)
+        if self.native:
+            self.native.record_forward()
+        else:
+            self._record_forward()
         if size.differentiable:
-            self.grad_x, self.grad_v = self._buffer((N,), "vec3"), self._buffer((N,), "vec3")
-            self.grad_C, self.grad_F = self._buffer((N,), "mat33"), self._buffer((N,), "mat33")
-            self.grad_F_trial, self.grad_tau = self._buffer((N,), "mat33"), self._buffer((N,), "mat33")
-            self.grad_F_elastic = self._buffer((N,), "mat33")
+            self.grad_x, self.grad_v = self.buffer((N,), "vec3"), self.buffer((N,), "vec3")
+            self.grad_C, self.grad_F = self.buffer((N,), "mat33"), self.buffer((N,), "mat33")
+            self.grad_F_trial, self.grad_tau = self.buffer((N,), "mat33"), self.buffer((N,), "mat33")
+            self.grad_F_elastic = self.buffer((N,), "mat33")
             self.grad_states = (self.grad_x, self.grad_v, self.grad_F, self.grad_C)
             if size.total:
-                self.grad_F_total = self._buffer((N,), "mat33")
+                self.grad_F_total = self.buffer((N,), "mat33")
                 self.grad_states += (self.grad_F_total,)
-            self.grad_stuck = self._buffer((N if self._contact else 1,), "vec3")
+            self.grad_stuck = self.buffer((N if self._contact else 1,), "vec3")
             if self._contact:
                 self.grad_states += (self.grad_stuck,)
-            self.grad_grid = self._buffer((2, nodes), "vec4")
-            self._record_adjoint()
+            if self.native:
+                self.native.record_adjoint()
+            else:
+                self.grad_grid = self.buffer((2, nodes), "vec4")
+                self._record_adjoint()
 
     def at(self, step: int) -> int:
         """Index of the state before a step."""
@@ -171,8 +187,8 @@ class Workspace:
         self.mass.copy_(mass)
         self.vol0.copy_(vol0)
         self.radius.copy_(contact_radius(vol0))
-        self.frictions = frictions
-        if self.size.n_poses == 1:
+        changed, self.frictions = not np.array_equal(frictions, self.frictions), frictions
+        if changed and self.size.n_poses == 1:
             self._load_obstacles([0.0])
 
     def pose_at(self, step: int) -> int:
@@ -244,6 +260,9 @@ class Workspace:
 
     def transfer_to_grid(self, step: int) -> None:
         """From tau and the state of a step to the velocities of the nodes."""
+        if self.native:
+            self.native.run("to_grid", step)
+            return
         cached = self.cached_at(step)
         self.grid[cached].zero_()
         if self.size.model.clamps:
@@ -254,6 +273,9 @@ class Workspace:
 
     def transfer_to_particles(self, step: int) -> None:
         """From velocities of the nodes to x, v, C and the total deformation after the step, and to F_trial."""
+        if self.native:
+            self.native.run("to_particles", step)
+            return
         now, after = self.at(step), self.at(step + 1)
         _run(self._g2p, now, after, self.cached_at(step), step, self.pose_at(step))
         if self.size.total:
@@ -261,17 +283,21 @@ class Workspace:
 
     def trial_deformation(self, step: int) -> None:
         """Recompute F_trial of a step from the F before and the C after it."""
+        if self.native:
+            self.native.run("to_trial", step)
+            return
         _run(self._trial, self.at(step), self.at(step + 1), self.cached_at(step))
 
     def tracer_launch(self, tracers: Tensor) -> wp.Launch:
-        """A recorded launch, for `move_tracers`, that advects `tracers` (M, 3) in place."""
-        kernel = forward_kernels(self.size.dtype, self.size.scatter, self._features).advect_tracers
+        """A recorded launch, for `move_tracers` and `SegmentLoop`, that advects `tracers` (M, 3) in place."""
         positions = wp.from_torch(tracers, dtype=warp_types(self.size.dtype).vec3)
-        return self._record(kernel, len(tracers), 0, self._rows(self.grid_v), positions)
+        return self.record(
+            self._deformation.advect_tracers, len(tracers), 0, self._rows(self.grid_v), positions
+        )
 
     def move_tracers(self, launch: wp.Launch, step: int) -> None:
         """Advect tracers by the node velocities of a step."""
-        _run(launch, self.cached_at(step))
+        _run(launch, 0 if self.native else self.cached_at(step))
 
     def transfer_adjoint(self, step: int) -> None:
         """From gradients of the state after a step and of F_trial to those of the state before it and of tau.
@@ -279,6 +305,9 @@ class Workspace:
         grad_x, grad_v, grad_C and grad_F_total are updated in place, and grad_F is set to the contribution of F_trial.
         Call it for decreasing steps after clearing `grad_grid` once.
         """
+        if self.native:
+            self.native.run("adjoint", step)
+            return
         now, after, cached = self.at(step), self.at(step + 1), self.cached_at(step)
         side = step % 2
         if self.size.total:
@@ -297,7 +326,7 @@ class Workspace:
         with wp.ScopedStream(stream, sync_enter=False):
             yield
 
-    def _buffer(self, shape: tuple[int, ...], kind: str = "", dtype: torch.dtype | None = None) -> Tensor:
+    def buffer(self, shape: tuple[int, ...], kind: str = "", dtype: torch.dtype | None = None) -> Tensor:
         """Zeros of a kind of `warp_types`, or else numbers of a dtype, with a Warp view for the launches."""
         warp_type = getattr(warp_types(self.size.dtype), kind) if kind else None
         tail = {"vec3": (3,), "vec4": (4,), "mat33": (3, 3)}.get(kind, ())
@@ -311,7 +340,7 @@ class Workspace:
         rows = nodes.as_strided((*lead, count - 2, 3, width), (*nodes.stride()[:-1], width, 1))
         return wp.from_torch(rows, dtype=warp_types(self.size.dtype).mat34)
 
-    def _record(self, kernel: wp.Kernel, dim: int, *args: int | Tensor | wp.array) -> wp.Launch:
+    def record(self, kernel: wp.Kernel, dim: int, *args: int | Tensor | wp.array) -> wp.Launch:
         inputs = [self._views[id(arg)] if isinstance(arg, Tensor) else arg for arg in args]
         options = {"block_dim": BLOCK} if self.size.device.type == "cuda" else {}
         return wp.launch(
@@ -323,18 +352,27 @@ class Workspace:
             **options,
         )
 
+    def clear_grids(self) -> None:
+        """Clear nodes that are not numbers, which may be outside the spans, after a simulation that diverged."""
+        if self.native:
+            self.native.grids.zero_()
+
     @property
     def _contact(self) -> bool:
         """Whether particles touch colliders."""
         return self.size.model.contact == "particles"
 
     @property
-    def _features(self) -> tuple[str, ...]:
+    def features(self) -> tuple[str, ...]:
         """Features of the model for the kernels."""
         meshes = any(collider.distances for collider in self.size.model.colliders)
-        return (
-            ("contact",) * self._contact + ("meshes",) * meshes + ("clamps",) * bool(self.size.model.clamps)
-        )
+        has = {
+            "contact": self._contact,
+            "meshes": meshes,
+            "clamps": bool(self.size.model.clamps),
+            "walls": self.size.scatter == "native" and self.size.model.wall_nodes > 0,
+        }
+        return tuple(name for name, value in has.items() if value)
 
     @property
     def _node_count(self) -> int:
@@ -348,49 +386,53 @@ class Workspace:
         return -(-N // BLOCK) * BLOCK if self.sorts else N
 
     def _record_forward(self) -> None:
-        k = forward_kernels(self.size.dtype, self.size.scatter, self._features)
+        k = forward_kernels(self.size.dtype, self.size.scatter, self.features)
         N, nodes = self.size.particles, self._node_count
         rows, rows_v = self._rows(self.grid), self._rows(self.grid_v)
         held = self.holds, self.clamp
         if self.sorts:
-            self._cells = self._record(k.cells, N, 0, self.x, self.cells)
-        self._p2g = self._record(
+            self._cells = self.record(k.cells, N, 0, self.x, self.cells)
+        self._p2g = self.record(
             k.p2g, self._scattering_threads, 0, 0, 0, 0, 0, self.order,
             self.x, self.v, self.C, self.tau, self.mass, self.vol0, self.radius,
             self.obstacles, self.distances, self.stuck, *held, self.held_mass, self.held_by, rows,
         )  # fmt: skip
-        self._grid_update = self._record(
+        self._grid_update = self.record(
             k.grid_update, nodes, 0, 0, self.grid, self.grid_v, self.holds, self.held_mass, self.held_by
         )
-        self._g2p = self._record(
+        self._g2p = self.record(
             k.g2p, N, 0, 0, 0, 0, 0,
             rows_v, self.x, self.v, self.C, self.F, self.F_trial, *held, self.faults,
         )  # fmt: skip
-        self._trial = self._record(k.trial_deformation, N, 0, 0, 0, self.C, self.F, self.F_trial)
+        self._trial = self.record(
+            self._deformation.trial_deformation, N, 0, 0, 0, self.C, self.F, self.F_trial
+        )
         if self.size.total:
             F_total = self.F_total
-            self._total = self._record(k.trial_deformation, N, 0, 0, 0, self.C, F_total, F_total)
+            self._total = self.record(
+                self._deformation.trial_deformation, N, 0, 0, 0, self.C, F_total, F_total
+            )
 
     def _record_adjoint(self) -> None:
-        k = adjoint_kernels(self.size.dtype, self.size.scatter, self._features)
+        k = adjoint_kernels(self.size.dtype, self.size.scatter, self.features)
         N, nodes = self.size.particles, self._node_count
         rows_v, grad_rows = self._rows(self.grid_v), self._rows(self.grad_grid)
         held = self.holds, self.clamp
-        self._g2p_adjoint = self._record(
+        self._g2p_adjoint = self.record(
             k.g2p_adjoint, self._scattering_threads, 0, 0, 0, 0, 0, 0, self.order,
             self.x, self.v, self.C, self.F, rows_v,
             self.grad_v, self.grad_C, self.grad_F_trial, self.grad_x, self.grad_F, *held, grad_rows,
         )  # fmt: skip
-        self._grid_adjoint = self._record(k.grid_adjoint, nodes, 0, 0, self.grid, self.grad_grid)
-        self._p2g_adjoint = self._record(
+        self._grid_adjoint = self.record(k.grid_adjoint, nodes, 0, 0, self.grid, self.grad_grid)
+        self._p2g_adjoint = self.record(
             k.p2g_adjoint, N, 0, 0, 0, 0,
             self.x, self.v, self.C, self.tau, self.mass, self.vol0, self.radius,
             self.obstacles, self.distances, self.stuck, *held, grad_rows,
             self.grad_x, self.grad_v, self.grad_C, self.grad_tau, self.grad_stuck,
         )  # fmt: skip
         if self.size.total:
-            self._total_adjoint = self._record(
-                k.total_adjoint, N, 0, 0, self.C, self.F_total, self.grad_C, self.grad_F_total
+            self._total_adjoint = self.record(
+                self._deformation.total_adjoint, N, 0, 0, self.C, self.F_total, self.grad_C, self.grad_F_total
             )
 
 

@@ -55,11 +55,12 @@ def test_free_fall(name, dtype, skip):
     assert (path.F.double() - torch.eye(3)).abs().max() < 60 * 16 * EPS[dtype]
 
 
-def test_p2g_conserves_mass_and_momentum():
+@pytest.mark.parametrize("scatter", ["native", "atomic"])
+def test_p2g_conserves_mass_and_momentum(scatter):
     """Whatever C and tau are: the weights sum to 1 and the weighted offsets to 0."""
     x, mass, vol0 = cube(side=0.5)
     v, _, C = strained(x)
-    ws = Workspace(WorkspaceSize(WEIGHTLESS, len(x), x.dtype, x.device))
+    ws = Workspace(WorkspaceSize(WEIGHTLESS, len(x), x.dtype, x.device, scatter=scatter))
     for buffer, value in ((ws.x, x), (ws.v, v), (ws.C, C), (ws.tau, 1e4 * C)):
         buffer[0].copy_(value)
     ws.mass.copy_(mass)

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from neuma_lib.device import launch
-from neuma_lib.mechanics import neural_fused, structured_kernels
+from neuma_lib.mechanics import analytic_kernels, neural_fused, structured_kernels
 from neuma_lib.splatting import compositor_cuda
 
 COMPILER = shutil.which("g++")
@@ -259,3 +259,33 @@ class EmulatedStructuredLaws:
         ):
             _launch(getattr(self.library, f"{which}_{name}"), *size, 0, *arguments)
         return [result, grad_F, *totals]
+
+
+class EmulatedAnalyticLaws:
+    """The kernels of ``analytic_kernels`` on the CPU."""
+
+    def __init__(self, folder: Path, dtype: torch.dtype):
+        self.dtype = dtype
+        real = {torch.float32: "float", torch.float64: "double"}[dtype]
+        forward = f"Array<{real}> F_, Array<{real}> rows_, int copies, int n, Array<{real}> out_"
+        backward = f"Array<{real}> F_, Array<{real}> rows_, int copies, int n, Array<{real}> grad_out_"
+        backward += f", Array<{real}> grad_F_, Array<double> partials_"
+        uncached = "    const uint64_t cache = 0;\n"  # a GPU caches nothing
+        bodies = []
+        for kind in ("elasticity", "plasticity"):
+            for name, parameters in (("evaluate", forward), ("vjp", backward)):
+                text = analytic_kernels.source(kind, name == "vjp", dtype)
+                bodies.append((f"{name}_{kind}", parameters, _addresses(parameters) + uncached + text))
+        self.library = _library(folder, f"analytic_{real}", tuple(bodies), "-D__CUDA_ARCH__=800")
+
+    def __call__(self, part, F, weights, g) -> list[torch.Tensor]:
+        """Result, gradient of F (copies n, 3, 3) and gradient of the rows (copies, 1 + COEFFICIENTS)."""
+        F, rows, g = (x.to(self.dtype).contiguous() for x in (F, weights[0], g))
+        result, grad_F = (torch.full_like(F, torch.nan) for _ in range(2))
+        copies, n = len(rows), len(F) // len(rows)
+        partials = torch.full((copies, n, analytic_kernels.COEFFICIENTS), torch.nan, dtype=torch.float64)
+        threads = analytic_kernels.THREADS
+        for name, arguments in (("evaluate", (result,)), ("vjp", (g, grad_F, partials))):
+            function = getattr(self.library, f"{name}_{part.part}")
+            _launch(function, -(-len(F) // threads), threads, 0, F, rows, copies, n, *arguments)
+        return [result, grad_F, torch.nn.functional.pad(partials.sum(1), (1, 0)).to(self.dtype)]

@@ -1,4 +1,4 @@
-"""Kernels of the neural and of the structured laws, and of analytic laws side by side."""
+"""Kernels of the neural, the structured and the analytic laws."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from typing import get_args
 import torch
 
 from neuma_lib.mechanics.analytic import analytic_law
-from neuma_lib.mechanics.analytic_fused import side_by_side
 from neuma_lib.mechanics.law import AdjointPrecision, Law
 from neuma_lib.mechanics.neural import neural_law
 from neuma_lib.mechanics.structured import FORMS, structured_law
@@ -19,10 +18,9 @@ SPEC = {
 
 
 def compile_kernels(device: torch.device) -> None:
-    """All networks, forward and backward, in both precisions of states and of adjoints; analytic laws in the one of
-    identification.
-    """
+    """All laws, forward and backward, in both precisions of states and of adjoints. Analytic laws share kernels."""
     laws: list[Law] = [neural_law(), *(structured_law({**SPEC, "form": form}) for form in FORMS)]
+    laws.append(analytic_law(SPEC))
     for dtype in (torch.float32, torch.float64):
         for law in laws:
             law.to(device, dtype)
@@ -32,7 +30,3 @@ def compile_kernels(device: torch.device) -> None:
                 value = part.evaluate(F, weights)
                 for part.adjoint_precision in get_args(AdjointPrecision):
                     part.vjp(F, weights, torch.ones_like(value))
-    F = torch.eye(3, device=device).repeat(4, 1, 1)
-    law = side_by_side([analytic_law(SPEC)], device)
-    for part in (law.elasticity, law.plasticity):
-        part.evaluate(F, tuple(w.to(F.dtype) for w in part.weights()))

@@ -1,0 +1,120 @@
+"""Launches of `transfers` on a CPU for the buffers of a workspace."""
+
+from __future__ import annotations
+
+import weakref
+from typing import TYPE_CHECKING
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from neuma_lib.sim.kernels import deformation_kernels
+from neuma_lib.sim.sequence import Index, LaunchSequence, Repeated
+from neuma_lib.sim.transfers import transfer_kernels
+
+if TYPE_CHECKING:
+    from neuma_lib.sim.workspace import Workspace
+
+PADDING = 1
+"""Nodes beyond the end of a grid, which the loops read and write with the three before them."""
+
+
+class NativeTransfers:
+    """Launches of a step. Arguments of the kernels are buffers of the workspace, or of this object, by name.
+
+    Attributes:
+        grids: momentum and mass, velocity, and gradient of the nodes, shape (2 or 3, nodes + PADDING, 4).
+        to_grid: from tau and the state to the velocities of the nodes.
+        to_particles: from these to the state after the step. F_trial is the F of that state if the key is True.
+        to_trial: recomputes F_trial.
+        adjoint: from gradients of the state after the step and of F_trial, with the same keys, to those of the state
+            before it and of tau.
+        add_elastic: adds grad_F_elastic to grad_F.
+    """
+
+    def __init__(self, ws: Workspace):
+        size, model = ws.size, ws.size.model
+        self._ws = weakref.proxy(ws)  # which owns this object
+        self._kernels = transfer_kernels(size.dtype, ws.features)
+        self._deformation = deformation_kernels(size.dtype)
+        self.grids = ws.buffer((2 + size.differentiable, size.copies * model.nodes**3 + PADDING), "vec4")
+        self.spans = ws.buffer((size.copies * 6 * model.nodes**2,), dtype=torch.int32)
+        self.mass_now, self.vol_now, self.radius_now = ws.mass, ws.vol0, ws.radius
+        if model.clamps:
+            self.mass_now, self.vol_now, self.radius_now = (
+                ws.buffer((size.particles,), "real") for _ in range(3)
+            )
+        touching = size.particles if "contact" in ws.features else 1
+        self.v_now = ws.buffer((touching,), "vec3")
+        self.near = ws.buffer((touching,), dtype=torch.int32)
+        self.touching = ws.buffer((1,), dtype=torch.int32)
+
+    def record_forward(self) -> None:
+        """Record the launches of a step."""
+        k, N = self._kernels, self._ws.size.particles
+        self.to_grid = [self._launch(k.hold, N)] if "clamps" in self._ws.features else []
+        self.to_grid += [self._launch(k.touch)] if "contact" in self._ws.features else []
+        self.to_grid += [self._launch(k.p2g), self._launch(k.grid_update)]
+        self.to_trial = [self._launch(k.trial_deformation)]
+        self.to_particles = {elastic: self._moves(elastic) for elastic in (False, True)}
+        self._steps = {
+            "to_grid": LaunchSequence(self.to_grid),
+            "to_particles": LaunchSequence(self.to_particles[False]),
+            "to_trial": LaunchSequence(self.to_trial),
+        }
+
+    def record_adjoint(self) -> None:
+        """Record the launches of the adjoint of a step."""
+        self.add_elastic = self._launch(self._kernels.add)
+        self.adjoint = {elastic: self._adjoints(elastic) for elastic in (False, True)}
+        self._steps["adjoint"] = LaunchSequence(self.adjoint[False])
+
+    def run(self, name: str, step: int) -> None:
+        """Run the launches of that name for a step."""
+        self._steps[name].run(step)
+
+    def index(self, name: str) -> Index:
+        """How an index of the kernels depends on the step."""
+        size = self._ws.size
+        return {
+            "now": Index(modulus=size.n_states),
+            "after": Index(1, size.n_states),
+            "cached": Index(modulus=size.n_cached_steps),
+            "pose": Index(modulus=size.n_poses),
+            "step": Index(),
+        }[name]
+
+    def _moves(self, elastic: bool) -> list[Repeated]:
+        ws, k = self._ws, self._kernels
+        trial = dict(F_trial=ws.F, cached="after") if elastic else {}
+        launches = [self._launch(k.g2p, **trial)]
+        if "clamps" in ws.features:
+            launches.append(self._launch(k.move_held, ws.size.particles, **trial))
+            launches.append(self._launch(k.trial_deformation, **trial))  # the bytes of a recomputation
+        if ws.size.total:
+            total = dict(F=ws.F_total, F_trial=ws.F_total, cached="after")
+            launches.append(self._launch(k.trial_deformation, **total))
+        return launches
+
+    def _adjoints(self, elastic: bool) -> list[Repeated]:
+        ws, k, N = self._ws, self._kernels, self._ws.size.particles
+        trial = dict(grad_F_trial=ws.grad_F) if elastic else {}
+        launches = [self._launch(self._deformation.total_adjoint, N)] if ws.size.total else []
+        launches.append(self._launch(k.g2p_adjoint, **trial))
+        launches += [self._launch(k.held_adjoint, N, **trial)] if "clamps" in ws.features else []
+        launches += [self._launch(k.grid_adjoint), self._launch(k.p2g_adjoint)]
+        launches += [self._launch(k.touch_adjoint)] if "contact" in ws.features else []
+        return launches
+
+    def _launch(self, kernel: wp.Kernel, dim: int = 1, **others: Tensor | str) -> Repeated:
+        """A launch whose arguments after the constants are indices or buffers by name, or those of ``others``."""
+        indices, arguments = {}, []
+        for position, label in enumerate(arg.label for arg in kernel.adj.args):
+            if label in ("now", "after", "cached", "pose", "step"):
+                indices[position] = self.index(others.get(label, label))
+                arguments.append(0)
+            elif position:
+                own = getattr(self if hasattr(self, label) else self._ws, label, None)
+                arguments.append(others.get(label, own))
+        return Repeated(self._ws.record(kernel, dim, *arguments), indices)

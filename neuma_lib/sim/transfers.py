@@ -1,0 +1,444 @@
+"""Transfers on a CPU: each kernel is one thread that loops over all particles or nodes in vector code.
+
+``transfers.h`` has the loops. They compute what `kernels` and `adjoint_kernels` do, with three differences:
+
+- Nodes that no particle touches are neither cleared nor updated. ``spans`` (copies, 6, nodes^2) has the first and last
+  in each row of the grid.
+- Grids of earlier steps are not kept. The reverse loop computes them again, which takes less time than the laws.
+- Contact and clamps are passes over the particles before and after the loops, with the functions of other devices.
+  Clamped particles have no mass in ``mass_now``.
+"""
+
+# No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
+import functools
+from types import SimpleNamespace
+
+import torch
+import warp as wp
+
+from neuma_lib.device import native_source, start_warp
+from neuma_lib.sim.adjoint_kernels import adjoint_functions
+from neuma_lib.sim.clamp_kernels import clamp_functions, hold_type
+from neuma_lib.sim.contact_kernels import contact_functions, obstacle_type
+from neuma_lib.sim.kernels import NO_CONTACT, forward_functions, grid_functions, warp_types
+
+start_warp()
+
+_TEXT = native_source(__file__, ".h")
+
+
+def _native(dtype: torch.dtype, *parts: str, held: bool = False) -> str:
+    """C++ source of a loop from its parts."""
+    text = "".join(_TEXT[part] for part in ("start", *parts, "end"))
+    return text.replace("REAL", {torch.float32: "float", torch.float64: "double"}[dtype]).replace(
+        "HELD", str(int(held))
+    )
+
+
+@functools.cache
+def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> SimpleNamespace:
+    """Kernels of the forward and of the reverse loop for a precision and features of the model (`forward_kernels`),
+    "walls" included, of which a node has a boundary condition."""
+    contact, clamps = "contact" in features, "clamps" in features
+    special_nodes = clamps or "walls" in features
+    Hold, (held, prescribed) = hold_type(dtype), vars(clamp_functions(dtype)).values()
+    Obstacle, touching = obstacle_type(dtype), contact_functions(dtype, "meshes" in features)
+    touch, touch_adjoint = touching.contact, touching.contact_adjoint
+    t, functions = warp_types(dtype), grid_functions(dtype)
+    real, vec3, vec4, mat33, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.GridConstants
+    obstacle_row = functions.obstacle_row
+    forward, adjoint = forward_functions(dtype, clamps), adjoint_functions(dtype, clamps)
+    hold_mass, update_node, move_particle = forward.hold_mass, forward.update_node, forward.move_particle
+    node_adjoint, deformation_adjoint = adjoint.node_adjoint, adjoint.deformation_adjoint
+    moved_mask = functions.moved_mask
+    module = f"neuma_lib.sim.transfers_{str(dtype).removeprefix('torch.')}_{'_'.join(features)}"
+    kernel = functools.partial(wp.kernel, enable_backward=False, module=module)
+
+    @wp.func_native(_native(dtype, "lanes", "block", "spans", "momentum", "p2g"))
+    def p2g_loop(
+        c: GridConstants, x: wp.array(dtype=vec3), v: wp.array(dtype=vec3), C: wp.array(dtype=mat33),
+        tau: wp.array(dtype=mat33), mass: wp.array(dtype=real), vol0: wp.array(dtype=real),
+        spans: wp.array(dtype=wp.int32), grid: wp.array2d(dtype=vec4),
+    ): ...  # fmt: skip
+
+    @wp.func_native(_native(dtype, "grid_update"))
+    def grid_loop(
+        c: GridConstants, spans: wp.array(dtype=wp.int32), grid: wp.array(dtype=vec4), grid_v: wp.array(dtype=vec4)
+    ): ...  # fmt: skip
+
+    @wp.func_native(_native(dtype, "lanes", "block", "g2p", held=clamps))
+    def g2p_loop(
+        c: GridConstants, step: wp.int32, mass: wp.array(dtype=real), grid_v: wp.array(dtype=vec4),
+        x: wp.array(dtype=vec3), F: wp.array(dtype=mat33), x_after: wp.array(dtype=vec3),
+        v_after: wp.array(dtype=vec3), C_after: wp.array(dtype=mat33), F_trial: wp.array(dtype=mat33),
+        faults: wp.array2d(dtype=wp.int64),
+    ): ...  # fmt: skip
+
+    @wp.func_native(_native(dtype, "trial"))
+    def trial_loop(
+        c: GridConstants, C_after: wp.array(dtype=mat33), F: wp.array(dtype=mat33), F_trial: wp.array(dtype=mat33)
+    ): ...  # fmt: skip
+
+    @wp.func_native(_native(dtype, "lanes", "block", "g2p_adjoint", held=clamps))
+    def g2p_adjoint_loop(
+        c: GridConstants, mass: wp.array(dtype=real), grid_v: wp.array(dtype=vec4), x: wp.array(dtype=vec3),
+        F: wp.array(dtype=mat33), x_after: wp.array(dtype=vec3), v_after: wp.array(dtype=vec3),
+        C_after: wp.array(dtype=mat33), grad_v: wp.array(dtype=vec3), grad_C: wp.array(dtype=mat33),
+        grad_F_trial: wp.array(dtype=mat33), grad_x: wp.array(dtype=vec3), grad_F: wp.array(dtype=mat33),
+        grad_grid: wp.array(dtype=vec4),
+    ): ...  # fmt: skip
+
+    @wp.func_native(_native(dtype, "grid_adjoint"))
+    def grid_adjoint_loop(
+        c: GridConstants, spans: wp.array(dtype=wp.int32), grid: wp.array(dtype=vec4),
+        grad_grid: wp.array(dtype=vec4),
+    ): ...  # fmt: skip
+
+    @wp.func_native(_native(dtype, "lanes", "block", "momentum", "p2g_adjoint"))
+    def p2g_adjoint_loop(
+        c: GridConstants, x: wp.array(dtype=vec3), v: wp.array(dtype=vec3), C: wp.array(dtype=mat33),
+        tau: wp.array(dtype=mat33), mass: wp.array(dtype=real), vol0: wp.array(dtype=real),
+        grad_grid: wp.array(dtype=vec4), grad_x: wp.array(dtype=vec3), grad_v: wp.array(dtype=vec3),
+        grad_C: wp.array(dtype=mat33), grad_tau: wp.array(dtype=mat33),
+    ): ...  # fmt: skip
+
+    @kernel
+    def hold(
+        c: GridConstants,
+        now: wp.int32,
+        pose: wp.int32,
+        x: wp.array2d(dtype=vec3),
+        mass: wp.array(dtype=real),
+        vol0: wp.array(dtype=real),
+        radius: wp.array(dtype=real),
+        holds: wp.array2d(dtype=Hold),
+        clamp: wp.array(dtype=wp.int32),
+        mass_now: wp.array(dtype=real),
+        vol_now: wp.array(dtype=real),
+        radius_now: wp.array(dtype=real),
+        held_mass: wp.array(dtype=real),
+        held_by: wp.array(dtype=wp.int32),
+    ):
+        """Mass, volume and radius of particles as the grid and colliders see them, and the mass of held ones."""
+        p = wp.tid()
+        mass_now[p] = mass[p]
+        vol_now[p] = vol0[p]
+        radius_now[p] = radius[p]
+        if held(holds, pose, clamp[p]):
+            hold_mass(c, p, x[now, p], mass[p], clamp[p], held_mass, held_by)
+            mass_now[p] = real(0.0)
+            vol_now[p] = real(0.0)
+            radius_now[p] = real(wp.static(NO_CONTACT))
+
+    @wp.func_native(_native(dtype, "lanes", "near"))
+    def near_obstacles(
+        c: GridConstants, others: wp.int32, x: wp.array(dtype=vec3), v: wp.array(dtype=vec3),
+        radius: wp.array(dtype=real), v_now: wp.array(dtype=vec3), stuck: wp.array(dtype=vec3),
+        near: wp.array(dtype=wp.int32),
+    ) -> wp.int32: ...  # fmt: skip
+
+    @wp.func_native(_native(dtype, "far"))
+    def clear_far(
+        c: GridConstants, near: wp.array(dtype=wp.int32), count: wp.int32, grad_stuck: wp.array(dtype=vec3)
+    ): ...
+
+    @kernel
+    def touch_obstacles(
+        c: GridConstants,
+        now: wp.int32,
+        after: wp.int32,
+        pose: wp.int32,
+        x: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        radius_now: wp.array(dtype=real),
+        obstacles: wp.array2d(dtype=Obstacle),
+        distances: wp.array(dtype=real),
+        stuck: wp.array2d(dtype=vec3),
+        v_now: wp.array(dtype=vec3),
+        near: wp.array(dtype=wp.int32),
+        touching: wp.array(dtype=wp.int32),
+    ):
+        """Velocities of the particles after contact with obstacles.
+
+        Sets the particles that touch one, ``near[: touching[0]]``, in increasing order.
+        """
+        count = near_obstacles(
+            c, obstacles.shape[1] - c.faces, x[now], v[now], radius_now, v_now, stuck[after], near
+        )
+        number = wp.int32(0)
+        for q in range(count):
+            p = near[q]
+            v_p, stuck_p, touches = touch(
+                obstacles, distances, obstacle_row(c, p, pose), c.faces, c.dt, x[now, p], v[now, p], stuck[now, p],
+                radius_now[p],
+            )  # fmt: skip
+            if touches > 0:
+                v_now[p] = v_p
+                stuck[after, p] = stuck_p
+                near[number] = p
+                number += 1
+        touching[0] = number
+
+    @kernel
+    def p2g(
+        c: GridConstants,
+        now: wp.int32,
+        cached: wp.int32,
+        x: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        C: wp.array2d(dtype=mat33),
+        tau: wp.array2d(dtype=mat33),
+        mass_now: wp.array(dtype=real),
+        vol_now: wp.array(dtype=real),
+        v_now: wp.array(dtype=vec3),
+        spans: wp.array(dtype=wp.int32),
+        grids: wp.array2d(dtype=vec4),
+    ):
+        """As `kernels.p2g`, and clears all grids before."""
+        if wp.static(contact):
+            p2g_loop(c, x[now], v_now, C[now], tau[cached], mass_now, vol_now, spans, grids)
+        else:
+            p2g_loop(c, x[now], v[now], C[now], tau[cached], mass_now, vol_now, spans, grids)
+
+    @kernel
+    def grid_update(
+        c: GridConstants,
+        pose: wp.int32,
+        spans: wp.array(dtype=wp.int32),
+        grids: wp.array2d(dtype=vec4),
+        holds: wp.array2d(dtype=Hold),
+        held_mass: wp.array(dtype=real),
+        held_by: wp.array(dtype=wp.int32),
+    ):
+        """As `kernels.grid_update`, for the nodes of the spans."""
+        if wp.static(special_nodes):
+            lines = c.n * c.n
+            for row in range(c.copies * lines):
+                span = (row / lines * 6 + 4) * lines + row % lines
+                for node in range(row * c.n + spans[span], row * c.n + spans[span + lines] + 1):
+                    update_node(c, pose, node, grids[0], grids[1], holds, held_mass, held_by)
+                    if wp.static(clamps):  # for the next step
+                        held_mass[node] = real(0.0)
+                        held_by[node] = 0
+        else:
+            grid_loop(c, spans, grids[0], grids[1])
+
+    @kernel
+    def g2p(
+        c: GridConstants,
+        now: wp.int32,
+        after: wp.int32,
+        cached: wp.int32,
+        step: wp.int32,
+        grids: wp.array2d(dtype=vec4),
+        mass_now: wp.array(dtype=real),
+        x: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        C: wp.array2d(dtype=mat33),
+        F: wp.array2d(dtype=mat33),
+        F_trial: wp.array2d(dtype=mat33),
+        faults: wp.array2d(dtype=wp.int64),
+    ):
+        """As `kernels.g2p`, for particles that are not clamped."""
+        g2p_loop(
+            c, step, mass_now, grids[1], x[now], F[now], x[after], v[after], C[after], F_trial[cached], faults
+        )
+
+    @kernel
+    def trial_deformation(
+        c: GridConstants,
+        now: wp.int32,
+        after: wp.int32,
+        cached: wp.int32,
+        C: wp.array2d(dtype=mat33),
+        F: wp.array2d(dtype=mat33),
+        F_trial: wp.array2d(dtype=mat33),
+    ):
+        """As `kernels.trial_deformation`, with the same bytes as g2p."""
+        trial_loop(c, C[after], F[now], F_trial[cached])
+
+    @kernel
+    def move_held(
+        c: GridConstants,
+        now: wp.int32,
+        after: wp.int32,
+        cached: wp.int32,
+        step: wp.int32,
+        pose: wp.int32,
+        x: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        C: wp.array2d(dtype=mat33),
+        F: wp.array2d(dtype=mat33),
+        F_trial: wp.array2d(dtype=mat33),
+        holds: wp.array2d(dtype=Hold),
+        clamp: wp.array(dtype=wp.int32),
+        faults: wp.array2d(dtype=wp.int64),
+    ):
+        """As `kernels.g2p`, for clamped particles."""
+        p = wp.tid()
+        if held(holds, pose, clamp[p]):
+            v_p = prescribed(holds[pose, clamp[p]], x[now, p])
+            C_p = holds[pose, clamp[p]].A
+            move_particle(c, now, after, cached, step, p, v_p, C_p, x, v, C, F, F_trial, faults)
+
+    @kernel
+    def g2p_adjoint(
+        c: GridConstants,
+        now: wp.int32,
+        after: wp.int32,
+        grids: wp.array2d(dtype=vec4),
+        mass_now: wp.array(dtype=real),
+        x: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        C: wp.array2d(dtype=mat33),
+        F: wp.array2d(dtype=mat33),
+        grad_v: wp.array(dtype=vec3),
+        grad_C: wp.array(dtype=mat33),
+        grad_F_trial: wp.array(dtype=mat33),
+        grad_x: wp.array(dtype=vec3),
+        grad_F: wp.array(dtype=mat33),
+    ):
+        """As `adjoint_kernels.g2p_adjoint`, for particles that are not clamped."""
+        g2p_adjoint_loop(
+            c, mass_now, grids[1], x[now], F[now], x[after], v[after], C[after], grad_v, grad_C, grad_F_trial,
+            grad_x, grad_F, grids[2],
+        )  # fmt: skip
+
+    @kernel
+    def held_adjoint(
+        c: GridConstants,
+        after: wp.int32,
+        pose: wp.int32,
+        x: wp.array2d(dtype=vec3),
+        C: wp.array2d(dtype=mat33),
+        grad_v: wp.array(dtype=vec3),
+        grad_F_trial: wp.array(dtype=mat33),
+        grad_x: wp.array(dtype=vec3),
+        grad_F: wp.array(dtype=mat33),
+        holds: wp.array2d(dtype=Hold),
+        clamp: wp.array(dtype=wp.int32),
+    ):
+        """As `adjoint_kernels.g2p_adjoint`, for clamped particles."""
+        p = wp.tid()
+        if held(holds, pose, clamp[p]):
+            grad_F[p] = deformation_adjoint(c, C[after, p], grad_F_trial[p])
+            g_x = wp.cw_mul(moved_mask(c, x[after, p]), grad_x[p])
+            grad_x[p] = g_x + wp.transpose(holds[pose, clamp[p]].A) * (grad_v[p] + c.dt * g_x)
+
+    @kernel
+    def grid_adjoint(c: GridConstants, spans: wp.array(dtype=wp.int32), grids: wp.array2d(dtype=vec4)):
+        """As `adjoint_kernels.grid_adjoint`, for the nodes of the spans."""
+        if wp.static(special_nodes):
+            lines = c.n * c.n
+            for row in range(c.copies * lines):
+                span = (row / lines * 6 + 4) * lines + row % lines
+                for node in range(row * c.n + spans[span], row * c.n + spans[span + lines] + 1):
+                    node_adjoint(c, node, grids[0], grids[2])
+        else:
+            grid_adjoint_loop(c, spans, grids[0], grids[2])
+
+    @kernel
+    def p2g_adjoint(
+        c: GridConstants,
+        now: wp.int32,
+        cached: wp.int32,
+        x: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        C: wp.array2d(dtype=mat33),
+        tau: wp.array2d(dtype=mat33),
+        mass_now: wp.array(dtype=real),
+        vol_now: wp.array(dtype=real),
+        v_now: wp.array(dtype=vec3),
+        grids: wp.array2d(dtype=vec4),
+        grad_x: wp.array(dtype=vec3),
+        grad_v: wp.array(dtype=vec3),
+        grad_C: wp.array(dtype=mat33),
+        grad_tau: wp.array(dtype=mat33),
+    ):
+        """As `adjoint_kernels.p2g_adjoint` without contact: grad_v is that of the velocity after it."""
+        if wp.static(contact):
+            p2g_adjoint_loop(
+                c,
+                x[now],
+                v_now,
+                C[now],
+                tau[cached],
+                mass_now,
+                vol_now,
+                grids[2],
+                grad_x,
+                grad_v,
+                grad_C,
+                grad_tau,
+            )
+        else:
+            p2g_adjoint_loop(
+                c,
+                x[now],
+                v[now],
+                C[now],
+                tau[cached],
+                mass_now,
+                vol_now,
+                grids[2],
+                grad_x,
+                grad_v,
+                grad_C,
+                grad_tau,
+            )
+
+    @kernel
+    def touch_adjoint_kernel(
+        c: GridConstants,
+        now: wp.int32,
+        pose: wp.int32,
+        x: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        radius_now: wp.array(dtype=real),
+        obstacles: wp.array2d(dtype=Obstacle),
+        distances: wp.array(dtype=real),
+        stuck: wp.array2d(dtype=vec3),
+        near: wp.array(dtype=wp.int32),
+        touching: wp.array(dtype=wp.int32),
+        grad_x: wp.array(dtype=vec3),
+        grad_v: wp.array(dtype=vec3),
+        grad_stuck: wp.array(dtype=vec3),
+    ):
+        """From gradients of velocity and displacement after contact to those of x (added), v and stuck (set)."""
+        for q in range(touching[0]):
+            p = near[q]
+            g_x, g_v, g_s = touch_adjoint(
+                obstacles, distances, obstacle_row(c, p, pose), c.faces, c.dt, x[now, p], v[now, p],
+                stuck[now, p], radius_now[p], grad_v[p], grad_stuck[p],
+            )  # fmt: skip
+            grad_x[p] = grad_x[p] + g_x
+            grad_v[p] = g_v
+            grad_stuck[p] = g_s
+        clear_far(c, near, touching[0], grad_stuck)
+
+    @wp.func_native(
+        """
+    for (int k = 0; k < 9 * added.shape[0]; ++k) ((REAL*)total.data)[k] += ((const REAL*)added.data)[k];
+    """.replace("REAL", {torch.float32: "float", torch.float64: "double"}[dtype])
+    )
+    def add_loop(added: wp.array(dtype=mat33), total: wp.array(dtype=mat33)): ...
+
+    @kernel
+    def add(c: GridConstants, grad_F_elastic: wp.array(dtype=mat33), grad_F: wp.array(dtype=mat33)):
+        add_loop(grad_F_elastic, grad_F)
+
+    return SimpleNamespace(
+        add=add,
+        hold=hold,
+        touch=touch_obstacles,
+        p2g=p2g,
+        grid_update=grid_update,
+        g2p=g2p,
+        trial_deformation=trial_deformation,
+        move_held=move_held,
+        g2p_adjoint=g2p_adjoint,
+        held_adjoint=held_adjoint,
+        grid_adjoint=grid_adjoint,
+        p2g_adjoint=p2g_adjoint,
+        touch_adjoint=touch_adjoint_kernel,
+    )
