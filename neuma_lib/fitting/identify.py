@@ -4,7 +4,7 @@ Fits the constants of every candidate family and selects the family with the low
 Levenberg-Marquardt through rollout and renderer, with a Jacobian of a few rollouts. It proceeds from coarse to fine
 levels of an image pyramid, because the basin of convergence of sharp images is about a pixel. Constants are unbounded
 logarithms or logits. A family is initialised from the best of its default guess, the scene's prior and the fits of
-simpler families. Families whose loss exceeds ``prune_factor`` times the best are dropped.
+simpler families. Families whose loss exceeds ``prune_factor`` times the best of their kind are dropped.
 
 The initial motion is estimated from the frames before contact, with an uncertainty that would bias the constants. The
 last level therefore also fits velocity and spin with a prior, and a constant shift and enlargement of the rendered
@@ -181,21 +181,24 @@ def _on_finer_grid(
     videos: Sequence[VideoResiduals],
     settings: IdentifyConfig,
 ) -> dict[str, FamilyRun]:
-    """Fits to the first frames on the finer grid, by name, of families with a held-out loss of at most ``prune_factor``
-    times the lowest, at most `_CONTENDERS`, that continue those on the grid of the model.
+    """Fits to the first frames on the finer grid, by name, which continue those on the grid of the model.
+
+    They are of at most `_CONTENDERS` families whose held-out loss is at most ``prune_factor`` times the lowest, and of
+    the best family of the other kind, elastic or with plastic flow.
 
     Images of the finer grid may differ by more than a pixel, hence the fit at the coarsest level first.
     """
     ranked = sorted((run for run in running if run.alive), key=lambda run: fits[run.family.name].score)
     limit = fits[ranked[0].family.name].score + math.log(settings.prune_factor) if ranked else 0.0
+    close = [run for run in ranked[:_CONTENDERS] if fits[run.family.name].score <= limit]
+    others = [run for run in ranked if run.family.flows != ranked[0].family.flows]
     fine = {}
-    for run in ranked[:_CONTENDERS]:
-        if fits[run.family.name].score <= limit:
-            again = FamilyRun(run.family, videos, [video.fitted for video in videos], settings, fine=True)
-            again.begin([run.values], 0, run.deviations)
-            if again.alive:
-                again.refine(len(settings.pyramid) - 1)
-            fine[run.family.name] = again
+    for run in dict.fromkeys([*close, *others[:1]]):
+        again = FamilyRun(run.family, videos, [video.fitted for video in videos], settings, fine=True)
+        again.begin([run.values], 0, run.deviations)
+        if again.alive:
+            again.refine(len(settings.pyramid) - 1)
+        fine[run.family.name] = again
     return fine
 
 
@@ -258,16 +261,18 @@ def _better_later(running: Sequence[FamilyRun]) -> list[tuple[FamilyRun, FamilyR
 
 
 def _prune(running: Sequence[FamilyRun], settings: IdentifyConfig) -> None:
-    """Drop families whose loss exceeds ``prune_factor`` times the best, and redundant families.
+    """Drop redundant families, and those whose loss exceeds ``prune_factor`` times the best of their kind.
 
-    Families that do not improve on a simpler one at a coarse level are kept, since finer levels have more information.
+    Elastic families are one kind and those with plastic flow another one, because the error of a coarse grid, at thin
+    limbs and near the floor, is like one of them. Families that do not improve on a simpler one at a coarse level are
+    kept, since finer levels have more information.
     """
     alive = [run for run in running if run.alive]
-    lowest = min((run.fit.cost for run in alive), default=0.0)
-    dropped = [
-        run for run in alive if run.fit.cost > settings.prune_factor * lowest or _is_redundant(run, alive)
-    ]
-    for run in dropped:
+    for run in alive:
+        lowest = min(other.fit.cost for other in alive if other.family.flows == run.family.flows)
+        run.alive = run.fit.cost <= settings.prune_factor * lowest
+    kept = [run for run in alive if run.alive]
+    for run in [run for run in kept if _is_redundant(run, kept)]:
         run.alive = False
 
 
