@@ -38,13 +38,15 @@ def other_shape(scene: SceneConfig) -> str:
     return SHAPES[(SHAPES.index(scene.shape) + 1) % len(SHAPES)]
 
 
-def falling(model: MPM, scene: SceneConfig, spec: Mapping[str, Any], grid: int, seed: int) -> Tensor:
+def falling(model: MPM, scene: SceneConfig, spec: Mapping[str, Any], grid: int) -> Tensor:
     """Tracers (T, M, 3) of the other shape on a grid.
 
     Args:
         model: simulator of the scene, with its grid and time step.
         spec: law.
-        seed: of the particles; tracers have the same start on every grid.
+
+    Returns:
+        Positions of tracers, which start at the same points on every grid.
     """
     factor = math.ceil(grid / model.grid)
     dt = model.dt / factor
@@ -54,7 +56,7 @@ def falling(model: MPM, scene: SceneConfig, spec: Mapping[str, Any], grid: int, 
     frames = [factor * round(n * scene.steps / (FRAMES - 1)) for n in range(FRAMES)]
     device = "cuda" if torch.cuda.is_available() else "cpu"
     truth = simulate_ground_truth(
-        fine, [body], frames, particles=None, tracers=4000, seed=seed, device=device
+        fine, [body], frames, particles=None, tracers=4000, seed=1000, device=device
     )
     return truth.tracers
 
@@ -71,14 +73,14 @@ def main() -> None:
         scene = settings.scene(name)
         model = simulator(settings, scene)
         true = scene.law.plain()
-        truth = falling(model, scene, true, args.truth, seed=1000)
+        truth = falling(model, scene, true, args.truth)
         for suffix in args.replicates:
             identified = read_json(result_path(settings, name + suffix, "identified.json"))
             laws = {"true": true, "material": identified["material"]["law"], "grid": identified["law"]}
             errors = {}
             for key, spec in laws.items():
                 try:
-                    path = falling(model, scene, spec, args.grid, seed=0)
+                    path = falling(model, scene, spec, args.grid)
                     errors[key] = tracer_errors(path, truth)["tracer_rmse_mm"]
                 except NonFiniteError:
                     errors[key] = math.inf

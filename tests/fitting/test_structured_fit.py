@@ -313,9 +313,9 @@ def test_a_video_from_a_frame_on_is_the_rest_of_the_whole(first):
 
 
 def test_obstacles_move_in_a_fit_as_in_the_video():
-    """A plate rises into the falling ball. The true law then reproduces the frames that inform on the law."""
-    plate = Collider("box", (0.4, 0.02, 0.4), centre=(0.5, -0.1, 0.5), velocity=(0.0, 2.0, 0.0))
-    model = replace(MODEL, colliders=(Collider("plane"), plate))
+    """A box rises into the falling ball. The true law then reproduces the frames that inform on the law."""
+    box = Collider("box", (0.4, 0.02, 0.4), centre=(0.5, -0.1, 0.5), velocity=(0.0, 2.0, 0.0))
+    model = replace(MODEL, colliders=(Collider("plane"), box))
     body, frames = ball(), (0, 20, 40, 60, 70, 80, 90, 100)
     loss = PixelLoss(body, observe(body, V0, frames, model=model))
     law = structured_law(TRUTH, MODEL.dt).double()
