@@ -1,0 +1,306 @@
+// Kernels of neural_vector.py: both directions of a network over blocks of BLOCK rows on a CPU. SVD, features and
+// stress hold a row per SIMD lane, the layers an output per lane. The module defines constants and polynomials.
+
+// Tiles of matrix products, in registers: ROWS rows times COLUMNS packs.
+//// tools
+    // 512 bits of consecutive numbers of a row
+    typedef Real Vector __attribute__((vector_size(64)));
+    const int SPAN = 64 / sizeof(Real);
+#if defined(__AVX512F__)
+    const int WIDE_COLUMNS = 4, NARROW_ROWS = 16, GROUP = 8;
+#else
+    const int WIDE_COLUMNS = 1, NARROW_ROWS = 4, GROUP = 2;
+#endif
+    struct Square { enum { ROWS = 4, COLUMNS = WIDE_COLUMNS }; };
+    struct Five { enum { ROWS = 5, COLUMNS = WIDE_COLUMNS }; };
+    struct Six { enum { ROWS = 6, COLUMNS = WIDE_COLUMNS }; };
+    struct Narrow { enum { ROWS = NARROW_ROWS, COLUMNS = 1 }; };
+    // out[r][c] = sum_k x[r row + k step] w[k][c] for r < rows and c < columns, or += if `adds`
+    auto product = [](auto tile, int rows, int columns, int depth, const Real* x, int row, int step, const Real* w,
+                      Real* out, bool adds) __attribute__((always_inline)) {
+        const int M = decltype(tile)::ROWS, N = decltype(tile)::COLUMNS;
+        for (int first = 0; first < columns; first += N * SPAN)
+            for (int r = 0; r < rows; r += M) {
+                Vector sum[M][N];
+                const Real* const from = x + r * row;
+                Vector* const to = (Vector*)(out + r * columns + first);
+                _Pragma("unroll") for (int m = 0; m < M; ++m)
+                    _Pragma("unroll") for (int c = 0; c < N; ++c)
+                        sum[m][c] = adds ? to[m * columns / SPAN + c] : Vector{};
+                _Pragma("nounroll") for (int k = 0; k < depth; ++k) {
+                    const Vector* const right = (const Vector*)(w + k * columns + first);
+                    _Pragma("unroll") for (int m = 0; m < M; ++m)
+                        _Pragma("unroll") for (int c = 0; c < N; ++c) sum[m][c] += from[m * row + k * step] * right[c];
+                }
+                _Pragma("unroll") for (int m = 0; m < M; ++m)
+                    _Pragma("unroll") for (int c = 0; c < N; ++c) to[m * columns / SPAN + c] = sum[m][c];
+            }
+    };
+    // x[i] becomes gelu(x[i]) = x[i] Phi(x[i]); slope[i] its derivative Phi + x phi. Phi - 1/2 is x times a polynomial in
+    // t in [-1, 1]. Groups of vectors hide the latency of the polynomials.
+    auto gelu = [&](bool differentiate, Real* x, Real* slope) __attribute__((always_inline)) {
+        for (int i = 0; i < BLOCK * HIDDEN / SPAN; i += GROUP) {
+            Vector* const values = (Vector*)x + i;
+            Vector a[GROUP], t[GROUP], distribution[GROUP], density[GROUP];
+            _Pragma("unroll") for (int j = 0; j < GROUP; ++j) {
+                a[j] = values[j] > RANGE ? Vector{} + RANGE : values[j];
+                a[j] = a[j] < -RANGE ? Vector{} - RANGE : a[j];
+                t[j] = a[j] * a[j] * (Real(2) / (RANGE * RANGE)) - Real(1);
+            }
+            auto polynomial = [&](const Real* coefficients, Vector* value) __attribute__((always_inline)) {
+                _Pragma("unroll") for (int j = 0; j < GROUP; ++j) value[j] = t[j] * coefficients[0] + coefficients[1];
+                _Pragma("unroll") for (int k = 2; k < TERMS; ++k)
+                    _Pragma("unroll") for (int j = 0; j < GROUP; ++j) value[j] = value[j] * t[j] + coefficients[k];
+            };
+            polynomial(DISTRIBUTION, distribution);
+            if (differentiate) polynomial(DENSITY, density);
+            _Pragma("unroll") for (int j = 0; j < GROUP; ++j) {
+                distribution[j] = a[j] * distribution[j] + Real(0.5);
+                if (differentiate) ((Vector*)slope)[i + j] = a[j] * density[j] + distribution[j];
+                values[j] = values[j] * distribution[j];
+            }
+        }
+    };
+    // Symmetric matrices as their diagonal and the elements 01, 02 and 12
+    const int ROW_OF[6] = {0, 1, 2, 0, 0, 1}, COLUMN_OF[6] = {0, 1, 2, 1, 2, 2};
+    auto element = [&](int k) { return 3 * ROW_OF[k] + COLUMN_OF[k]; };
+    auto mirrored = [&](int k) { return 3 * COLUMN_OF[k] + ROW_OF[k]; };
+    auto load = [&](uint64_t array, size_t first, int used, Pack* x) {
+        const Real* const p = (const Real*)array + 9 * first;
+        for (int l = 0; l < WIDTH; ++l)
+            for (int k = 0; k < 9; ++k) LANE(x[k], l) = p[9 * (l < used ? l : 0) + k];
+    };
+    auto store = [&](uint64_t array, size_t first, int used, const Pack* x) {
+        Real* const p = (Real*)array + 9 * first;
+        for (int l = 0; l < used; ++l)
+            for (int k = 0; k < 9; ++k) p[9 * l + k] = LANE(x[k], l);
+    };
+    // c = a b, with strides that allow to transpose either factor
+    auto matmul = [](const Pack* a, const Pack* b, Pack* c, int a_row, int a_column, int b_row, int b_column) {
+        for (int i = 0; i < 3; ++i)
+            for (int j = 0; j < 3; ++j)
+                c[3 * i + j] = a[i * a_row] * b[j * b_column] + a[i * a_row + a_column] * b[b_row + j * b_column] +
+                               a[i * a_row + 2 * a_column] * b[2 * b_row + j * b_column];
+    };
+    #define NN 3, 1, 3, 1
+    #define NT 3, 1, 1, 3
+    #define TN 1, 3, 3, 1
+    // Scratch memory. Weights with merged rows or columns of symmetric pairs, each as left and as right factor.
+    Real* free_memory = (Real*)work;
+    auto take = [&](int count) {
+        Real* const here = free_memory;
+        free_memory += count;
+        return here;
+    };
+    Real* const w0_T = take(10 * HIDDEN);      // (10, 64)
+    Real* const w1_T = take(HIDDEN * HIDDEN);  // (64, 64)
+    Real* const w2_T = take(HIDDEN * NARROW);  // (64, 16)
+    Real* const z = take(BLOCK * NARROW);      // features, then their gradient
+    Real* const y = take(BLOCK * NARROW);      // X, then its gradient
+    Real* const h0 = take(BLOCK * HIDDEN);
+    Real* const h1 = take(BLOCK * HIDDEN);
+    const Real* const W0_ = (const Real*)W0;
+    const Real* const W1_ = (const Real*)W1;
+    const Real* const W2_ = (const Real*)W2;
+    for (int o = 0; o < HIDDEN; ++o) {
+        for (int k = 0; k < 10; ++k) {
+            const Real* const w = W0_ + FEATURES * o;
+            const bool pair = k >= 6 && k < 9;
+            w0_T[HIDDEN * k + o] = k < 3 ? w[k] : k == 9 ? w[12] : w[3 + element(k - 3)] +
+                (pair ? w[3 + mirrored(k - 3)] : Real(0));
+        }
+        for (int i = 0; i < HIDDEN; ++i) w1_T[HIDDEN * i + o] = W1_[HIDDEN * o + i];
+        for (int k = 0; k < NARROW; ++k) {
+            const Real w = k < 6 ? Real(0.5) * (W2_[HIDDEN * element(k) + o] + W2_[HIDDEN * mirrored(k) + o]) : Real(0);
+            w2_T[NARROW * o + k] = w;
+        }
+    }
+    // Features of the packs of a block; kept[21] of a pack receives U, V and s, or has them if `again`
+    auto features = [&](size_t begin, Pack* kept, bool again) {
+        for (int pack = 0; pack < BLOCK / WIDTH; ++pack, kept += 21) {
+            const size_t first = begin + pack * WIDTH;
+            // lanes after the last row repeat a row, without gradient
+            const size_t start = first < (size_t)n ? first : n - 1;
+            const int used = n - start < WIDTH ? n - start : WIDTH;
+            Pack a[9], x[10];
+            load(F, start, used, a);
+            {GRAM}
+            for (int k = 0; k < 6; ++k) x[3 + k] = gram[element(k)] - (k < 3 ? Real(1) : Real(0));
+            x[9] = det - Real(1);
+            if (!again) {
+                {SVD}
+                for (int k = 0; k < 3; ++k) {
+                    kept[k] = u0[k];
+                    kept[3 + k] = u1[k];
+                    kept[6 + k] = u2[k];
+                    kept[9 + k] = v0[k];
+                    kept[12 + k] = v1[k];
+                    kept[15 + k] = v2[k];
+                    kept[18 + k] = s[k];
+                }
+            }
+            for (int k = 0; k < 3; ++k) x[k] = kept[18 + k] - Real(1);
+            for (int l = 0; l < WIDTH; ++l)
+                for (int k = 0; k < 10; ++k) z[NARROW * (pack * WIDTH + l) + k] = LANE(x[k], l);
+        }
+    };
+    // R = U V^T and X of a pack
+    auto rotation_and_output = [&](int pack, const Pack* kept, Pack* R, Pack* X) {
+        matmul(kept, kept + 9, R, 1, 3, 3, 1);
+        for (int l = 0; l < WIDTH; ++l)
+            for (int k = 0; k < 6; ++k) LANE(X[element(k)], l) = y[NARROW * (pack * WIDTH + l) + k];
+        for (int k = 3; k < 6; ++k) X[mirrored(k)] = X[element(k)];
+    };
+
+//// evaluate
+    Pack* const scratch = (Pack*)take(21 * BLOCK);
+    for (size_t begin = 0; begin < (size_t)n; begin += BLOCK) {
+        Pack* const kept = cache ? (Pack*)((Real*)cache + begin * CACHED) : scratch;
+        features(begin, kept, false);
+        product(Square(), BLOCK, HIDDEN, 10, z, NARROW, 1, w0_T, h0, false);
+        gelu(false, h0, nullptr);
+        product(Square(), BLOCK, HIDDEN, HIDDEN, h0, HIDDEN, 1, w1_T, h1, false);
+        if (KEEPS_LAYER && cache) {
+            Real* const layer = (Real*)cache + begin * CACHED + 21 * BLOCK;
+            for (int i = 0; i < BLOCK * HIDDEN / SPAN; ++i) ((Vector*)layer)[i] = ((Vector*)h1)[i];
+        }
+        gelu(false, h1, nullptr);
+        product(Narrow(), BLOCK, NARROW, HIDDEN, h1, HIDDEN, 1, w2_T, y, false);
+        for (int pack = 0; pack < BLOCK / WIDTH && begin + pack * WIDTH < (size_t)n; ++pack) {
+            const size_t first = begin + pack * WIDTH;
+            const int used = n - first < WIDTH ? n - first : WIDTH;
+            Pack f[9], R[9], X[9], P[9], value[9];
+            load(F, first, used, f);
+            rotation_and_output(pack, kept + 21 * pack, R, X);
+            matmul(R, X, P, NN);
+            if (ELASTIC) matmul(P, f, value, NT);
+            else for (int k = 0; k < 9; ++k) value[k] = f[k] + scale * P[k];
+            store(out, first, used, value);
+        }
+    }
+
+//// vjp
+    Real* const w0 = take(HIDDEN * NARROW);   // (64, 16)
+    Real* const w1 = take(HIDDEN * HIDDEN);   // (64, 64)
+    Real* const w2 = take(6 * HIDDEN);        // (6, 64)
+    Real* const slope0 = take(BLOCK * HIDDEN);
+    Real* const slope1 = take(BLOCK * HIDDEN);
+    Real* const g0 = take(BLOCK * HIDDEN);
+    Real* const g1 = take(BLOCK * HIDDEN);
+    Real* const sum0 = take(10 * HIDDEN);      // gradients of w0_T, w1 and w2
+    Real* const sum1 = take(HIDDEN * HIDDEN);
+    Real* const sum2 = take(6 * HIDDEN);
+    Pack* const scratch = (Pack*)take(21 * BLOCK);
+    for (int o = 0; o < HIDDEN; ++o) {
+        for (int k = 0; k < NARROW; ++k) w0[NARROW * o + k] = k < 10 ? w0_T[HIDDEN * k + o] : Real(0);
+        for (int k = 0; k < 6; ++k) w2[HIDDEN * k + o] = w2_T[NARROW * o + k];
+        for (int i = 0; i < HIDDEN; ++i) w1[HIDDEN * o + i] = W1_[HIDDEN * o + i];
+    }
+    for (int i = 0; i < HIDDEN * (10 + HIDDEN + 6); ++i) sum0[i] = Real(0);
+    for (size_t begin = 0; begin < (size_t)n; begin += BLOCK) {
+        Pack* const kept = cache ? (Pack*)((Real*)cache + begin * CACHED) : scratch;
+        features(begin, kept, cache != 0);
+        product(Square(), BLOCK, HIDDEN, 10, z, NARROW, 1, w0_T, h0, false);
+        gelu(true, h0, slope0);
+        if (KEEPS_LAYER && cache) {
+            const Real* const layer = (const Real*)cache + begin * CACHED + 21 * BLOCK;
+            for (int i = 0; i < BLOCK * HIDDEN / SPAN; ++i) ((Vector*)h1)[i] = ((const Vector*)layer)[i];
+        } else product(Square(), BLOCK, HIDDEN, HIDDEN, h0, HIDDEN, 1, w1_T, h1, false);
+        gelu(true, h1, slope1);
+        product(Narrow(), BLOCK, NARROW, HIDDEN, h1, HIDDEN, 1, w2_T, y, false);
+        Pack direct[BLOCK / WIDTH][9], grad_R[BLOCK / WIDTH][9];
+        for (int pack = 0; pack < BLOCK / WIDTH; ++pack) {
+            const size_t first = begin + pack * WIDTH;
+            Pack g[9], R[9], X[9], P[9], grad_P[9], grad_X[9];
+            if (first < (size_t)n) {
+                const int used = n - first < WIDTH ? n - first : WIDTH;
+                load(grad_out, first, used, g);
+                for (int l = used; l < WIDTH; ++l)
+                    for (int k = 0; k < 9; ++k) LANE(g[k], l) = Real(0);
+            } else for (int k = 0; k < 9; ++k) g[k] = Pack{};
+            rotation_and_output(pack, kept + 21 * pack, R, X);
+            if (ELASTIC) {
+                Pack f[9];
+                const size_t start = first < (size_t)n ? first : n - 1;
+                load(F, start, n - start < WIDTH ? n - start : WIDTH, f);
+                matmul(g, f, grad_P, NN);
+                matmul(R, X, P, NN);
+                matmul(g, P, direct[pack], TN);
+            } else for (int k = 0; k < 9; ++k) {
+                grad_P[k] = scale * g[k];
+                direct[pack][k] = g[k];
+            }
+            matmul(grad_P, X, grad_R[pack], NN);
+            matmul(R, grad_P, grad_X, TN);
+            for (int k = 3; k < 6; ++k) grad_X[element(k)] += grad_X[mirrored(k)];
+            for (int l = 0; l < WIDTH; ++l)
+                for (int k = 0; k < 6; ++k) y[NARROW * (pack * WIDTH + l) + k] = LANE(grad_X[element(k)], l);
+        }
+        product(Six(), 6, HIDDEN, BLOCK, y, 1, NARROW, h1, sum2, true);
+        product(Square(), BLOCK, HIDDEN, 6, y, NARROW, 1, w2, g1, false);
+        for (int i = 0; i < BLOCK * HIDDEN / SPAN; ++i) ((Vector*)g1)[i] *= ((Vector*)slope1)[i];
+        product(Square(), HIDDEN, HIDDEN, BLOCK, g1, 1, HIDDEN, h0, sum1, true);
+        product(Square(), BLOCK, HIDDEN, HIDDEN, g1, HIDDEN, 1, w1, g0, false);
+        for (int i = 0; i < BLOCK * HIDDEN / SPAN; ++i) ((Vector*)g0)[i] *= ((Vector*)slope0)[i];
+        product(Five(), 10, HIDDEN, BLOCK, z, 1, NARROW, g0, sum0, true);
+        product(Narrow(), BLOCK, NARROW, HIDDEN, g0, HIDDEN, 1, w0, z, false);
+        for (int pack = 0; pack < BLOCK / WIDTH && begin + pack * WIDTH < (size_t)n; ++pack) {
+            const size_t first = begin + pack * WIDTH;
+            const int used = n - first < WIDTH ? n - first : WIDTH;
+            const Pack* const u = kept + 21 * pack;
+            const Pack* const v = u + 9;
+            const Pack* const s = v + 9;
+            Pack f[9], gz[10], M[9], T[9], K[9], G[9];
+            load(F, first, used, f);
+            for (int l = 0; l < WIDTH; ++l)
+                for (int k = 0; k < 10; ++k) LANE(gz[k], l) = z[NARROW * (pack * WIDTH + l) + k];
+            // rotation and singular values: U K V^T, K_ij = (M_ij - M_ji) / (s_i + s_j), M = U^T grad_R V
+            matmul(u, grad_R[pack], T, NN);
+            matmul(T, v, M, NT);
+            for (int i = 0; i < 3; ++i) {
+                K[4 * i] = gz[i];
+                for (int j = i + 1; j < 3; ++j) {
+                    Pack total = s[i] + s[j];
+                    const Pack low = total < Real(0) ? Pack{} - FLOOR : Pack{} + FLOOR;
+                    total = total < FLOOR ? (total > -FLOOR ? low : total) : total;
+                    K[3 * i + j] = (M[3 * i + j] - M[3 * j + i]) / total;
+                    K[3 * j + i] = -K[3 * i + j];
+                }
+            }
+            matmul(u, K, T, TN);
+            matmul(T, v, M, NN);
+            // F^T F: F (G + G^T)
+            for (int k = 0; k < 3; ++k) G[4 * k] = gz[3 + k] + gz[3 + k];
+            for (int k = 3; k < 6; ++k) G[element(k)] = G[mirrored(k)] = gz[3 + k];
+            matmul(f, G, T, NN);
+            // det F: cofactors
+            for (int i = 0; i < 3; ++i)
+                for (int j = 0; j < 3; ++j) {
+                    const int i1 = (i + 1) % 3, i2 = (i + 2) % 3, j1 = (j + 1) % 3, j2 = (j + 2) % 3;
+                    const Pack cofactor = f[3 * i1 + j1] * f[3 * i2 + j2] - f[3 * i1 + j2] * f[3 * i2 + j1];
+                    M[3 * i + j] += T[3 * i + j] + gz[9] * cofactor + direct[pack][3 * i + j];
+                }
+            store(grad_F, first, used, M);
+        }
+    }
+    Real* const G0 = (Real*)total0;
+    Real* const G1 = (Real*)total1;
+    Real* const G2 = (Real*)total2;
+    for (int o = 0; o < HIDDEN; ++o) {
+        for (int k = 0; k < 3; ++k) G0[FEATURES * o + k] += sum0[HIDDEN * k + o];
+        for (int k = 0; k < 6; ++k) {
+            G0[FEATURES * o + 3 + element(k)] += sum0[HIDDEN * (3 + k) + o];
+            if (k >= 3) G0[FEATURES * o + 3 + mirrored(k)] += sum0[HIDDEN * (3 + k) + o];
+        }
+        G0[FEATURES * o + 12] += sum0[HIDDEN * 9 + o];
+        for (int k = 0; k < 6; ++k) {
+            G2[HIDDEN * element(k) + o] += (k < 3 ? Real(1) : Real(0.5)) * sum2[HIDDEN * k + o];
+            if (k >= 3) G2[HIDDEN * mirrored(k) + o] += Real(0.5) * sum2[HIDDEN * k + o];
+        }
+    }
+    for (int i = 0; i < HIDDEN * HIDDEN; ++i) G1[i] += sum1[i];
+
+//// end
+    #undef NN
+    #undef NT
+    #undef TN
