@@ -47,9 +47,10 @@
                 a[j] = a[j] < -RANGE ? Vector{} - RANGE : a[j];
                 t[j] = a[j] * a[j] * (Real(2) / (RANGE * RANGE)) - Real(1);
             }
-            auto polynomial = [&](const Real* coefficients, Vector* value) __attribute__((always_inline)) {
+            auto polynomial = [&](const auto& coefficients, Vector* value) __attribute__((always_inline)) {
+                const int terms = sizeof(coefficients) / sizeof(Real);
                 _Pragma("unroll") for (int j = 0; j < GROUP; ++j) value[j] = t[j] * coefficients[0] + coefficients[1];
-                _Pragma("unroll") for (int k = 2; k < TERMS; ++k)
+                _Pragma("unroll") for (int k = 2; k < terms; ++k)
                     _Pragma("unroll") for (int j = 0; j < GROUP; ++j) value[j] = value[j] * t[j] + coefficients[k];
             };
             polynomial(DISTRIBUTION, distribution);
