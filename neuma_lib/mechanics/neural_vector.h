@@ -6,6 +6,8 @@
     // 512 bits of consecutive numbers of a row
     typedef Real Vector __attribute__((vector_size(64)));
     const int SPAN = 64 / sizeof(Real);
+    const int MANTISSA = sizeof(Real) == 4 ? 23 : 52;
+    const Real ROUND = sizeof(Real) == 4 ? Real(12582912.0) : Real(6755399441055744.0);
 #if defined(__AVX512F__)
     const int WIDE_COLUMNS = 4, NARROW_ROWS = 16, GROUP = 8;
 #else
@@ -36,30 +38,40 @@
                     _Pragma("unroll") for (int c = 0; c < N; ++c) to[m * columns / SPAN + c] = sum[m][c];
             }
     };
-    // x[i] becomes gelu(x[i]) = x[i] Phi(x[i]); slope[i] its derivative Phi + x phi. Phi - 1/2 is x times a polynomial in
-    // t in [-1, 1]. Groups of vectors hide the latency of the polynomials.
+    // x[i] becomes gelu(x[i]) = x[i] Phi(x[i]), slope[i] its derivative Phi + x phi. Phi - 1/2 is x times a polynomial
+    // in t in [-1, 1], phi is 2^k times a polynomial in r in [-1/2, 1/2]. Groups of vectors hide latency.
     auto gelu = [&](bool differentiate, Real* x, Real* slope) __attribute__((always_inline)) {
+        typedef decltype(Vector{} < Vector{}) Bits;
         for (int i = 0; i < BLOCK * HIDDEN / SPAN; i += GROUP) {
             Vector* const values = (Vector*)x + i;
             Vector a[GROUP], t[GROUP], distribution[GROUP], density[GROUP];
-            _Pragma("unroll") for (int j = 0; j < GROUP; ++j) {
-                a[j] = values[j] > RANGE ? Vector{} + RANGE : values[j];
-                a[j] = a[j] < -RANGE ? Vector{} - RANGE : a[j];
-                t[j] = a[j] * a[j] * (Real(2) / (RANGE * RANGE)) - Real(1);
-            }
             auto polynomial = [&](const auto& coefficients, Vector* value) __attribute__((always_inline)) {
                 const int terms = sizeof(coefficients) / sizeof(Real);
                 _Pragma("unroll") for (int j = 0; j < GROUP; ++j) value[j] = t[j] * coefficients[0] + coefficients[1];
                 _Pragma("unroll") for (int k = 2; k < terms; ++k)
                     _Pragma("unroll") for (int j = 0; j < GROUP; ++j) value[j] = value[j] * t[j] + coefficients[k];
             };
-            polynomial(DISTRIBUTION, distribution);
-            if (differentiate) polynomial(DENSITY, density);
             _Pragma("unroll") for (int j = 0; j < GROUP; ++j) {
-                distribution[j] = a[j] * distribution[j] + Real(0.5);
-                if (differentiate) ((Vector*)slope)[i + j] = a[j] * density[j] + distribution[j];
-                values[j] = values[j] * distribution[j];
+                a[j] = values[j] > RANGE ? Vector{} + RANGE : values[j];
+                a[j] = a[j] < -RANGE ? Vector{} - RANGE : a[j];
+                t[j] = a[j] * a[j] * (Real(2) / (RANGE * RANGE)) - Real(1);
             }
+            polynomial(DISTRIBUTION, distribution);
+            _Pragma("unroll") for (int j = 0; j < GROUP; ++j) distribution[j] = a[j] * distribution[j] + Real(0.5);
+            if (differentiate) {
+                Bits k[GROUP];
+                _Pragma("unroll") for (int j = 0; j < GROUP; ++j) {
+                    const Vector exponent = a[j] * a[j] * Real(-0.72134752044448170);  // of 2
+                    // adding ROUND rounds to an integer, which is then in the last bits
+                    const Vector shifted = exponent + ROUND;
+                    t[j] = exponent - (shifted - ROUND);
+                    k[j] = (Bits)shifted << MANTISSA;
+                }
+                polynomial(DENSITY, density);
+                _Pragma("unroll") for (int j = 0; j < GROUP; ++j)
+                    ((Vector*)slope)[i + j] = a[j] * (Vector)((Bits)density[j] + k[j]) + distribution[j];
+            }
+            _Pragma("unroll") for (int j = 0; j < GROUP; ++j) values[j] = values[j] * distribution[j];
         }
     };
     // Symmetric matrices as their diagonal and the elements 01, 02 and 12
@@ -161,10 +173,6 @@
         product(Square(), BLOCK, HIDDEN, 10, z, NARROW, 1, w0_T, h0, false);
         gelu(false, h0, nullptr);
         product(Square(), BLOCK, HIDDEN, HIDDEN, h0, HIDDEN, 1, w1_T, h1, false);
-        if (KEEPS_LAYER && cache) {
-            Real* const layer = (Real*)cache + begin * CACHED + 21 * BLOCK;
-            for (int i = 0; i < BLOCK * HIDDEN / SPAN; ++i) ((Vector*)layer)[i] = ((Vector*)h1)[i];
-        }
         gelu(false, h1, nullptr);
         product(Narrow(), BLOCK, NARROW, HIDDEN, h1, HIDDEN, 1, w2_T, y, false);
         for (int pack = 0; pack < BLOCK / WIDTH && begin + pack * WIDTH < (size_t)n; ++pack) {
@@ -203,10 +211,7 @@
         features(begin, kept, cache != 0);
         product(Square(), BLOCK, HIDDEN, 10, z, NARROW, 1, w0_T, h0, false);
         gelu(true, h0, slope0);
-        if (KEEPS_LAYER && cache) {
-            const Real* const layer = (const Real*)cache + begin * CACHED + 21 * BLOCK;
-            for (int i = 0; i < BLOCK * HIDDEN / SPAN; ++i) ((Vector*)h1)[i] = ((const Vector*)layer)[i];
-        } else product(Square(), BLOCK, HIDDEN, HIDDEN, h0, HIDDEN, 1, w1_T, h1, false);
+        product(Square(), BLOCK, HIDDEN, HIDDEN, h0, HIDDEN, 1, w1_T, h1, false);
         gelu(true, h1, slope1);
         product(Narrow(), BLOCK, NARROW, HIDDEN, h1, HIDDEN, 1, w2_T, y, false);
         Pack direct[BLOCK / WIDTH][9], grad_R[BLOCK / WIDTH][9];

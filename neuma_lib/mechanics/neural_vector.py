@@ -25,20 +25,20 @@ from neuma_lib.mechanics.singular_values_kernels import END, FUSE, SVD, TYPES, f
 BLOCK = 64
 """Rows per block."""
 HIDDEN, NARROW = 64, 16
-KEEPS_LAYER = False
-CACHED = 21 + (HIDDEN if KEEPS_LAYER else 0)
+CACHED = 21
+"""Numbers per row in a cache: U, V and the singular values. To read activations takes longer than to compute them."""
 RANGE = {torch.float32: 5.75, torch.float64: 8.3}
 """|x| from which the standard normal distribution is constant to round-off."""
-TERMS = {torch.float32: (16, 18), torch.float64: (38, 38)}
+TERMS = {torch.float32: (16, 6), torch.float64: (36, 12)}
 """Coefficients of the polynomials for the distribution and the density, for an error of round-off."""
 SCRATCH = 2 * HIDDEN * (10 + HIDDEN + NARROW) + HIDDEN * (HIDDEN + 20) + BLOCK * (2 * NARROW + 6 * HIDDEN + 21)
 
 
-def chebyshev(function: Callable[[float], float], bound: float, terms: int) -> list[float]:
-    """Coefficients, highest power first, of the polynomial in t = 2 u / bound - 1 that interpolates f(u) at the
-    Chebyshev nodes of [0, bound]."""
+def chebyshev(function: Callable[[float], float], low: float, high: float, terms: int) -> list[float]:
+    """Coefficients, highest power first, of the polynomial in t that interpolates f at the Chebyshev nodes of
+    [low, high], which t in [-1, 1] spans."""
     angles = [math.pi * (k + 0.5) / terms for k in range(terms)]
-    values = [function(0.5 * bound * (1 + math.cos(angle))) for angle in angles]
+    values = [function(0.5 * (low + high) + 0.5 * (high - low) * math.cos(angle)) for angle in angles]
     total = [Fraction(0)] * terms
     older, old = [Fraction(1)], [Fraction(0), Fraction(1)]  # T_0, T_1 in exact arithmetic
     for n in range(terms):
@@ -54,12 +54,15 @@ def chebyshev(function: Callable[[float], float], bound: float, terms: int) -> l
 
 @cache
 def gelu_polynomials(dtype: torch.dtype) -> tuple[list[float], list[float]]:
-    """Polynomials in t = 2 (x / RANGE)^2 - 1 for (Phi(x) - 1/2) / x and the density of the standard normal
-    distribution Phi."""
-    bound, terms = RANGE[dtype] ** 2, TERMS[dtype]
-    distribution = chebyshev(lambda u: math.erf(math.sqrt(0.5 * u)) / (2 * math.sqrt(u)), bound, terms[0])
-    density = chebyshev(lambda u: math.exp(-0.5 * u) / math.sqrt(2 * math.pi), bound, terms[1])
-    return distribution, density
+    """Polynomials in t = 2 (x / RANGE)^2 - 1 for (Phi(x) - 1/2) / x, with the standard normal distribution Phi, and in r,
+    |r| <= 1/2, for 2^r / sqrt(2 pi)."""
+    terms = TERMS[dtype]
+    distribution = chebyshev(
+        lambda u: math.erf(math.sqrt(0.5 * u)) / (2 * math.sqrt(u)), 0.0, RANGE[dtype] ** 2, terms[0]
+    )
+    density = chebyshev(lambda r: 2**r / math.sqrt(2 * math.pi), -0.5, 0.5, terms[1])
+    powers = range(terms[1] - 1, -1, -1)
+    return distribution, [c * 2**power for c, power in zip(density, powers, strict=True)]
 
 
 def source(kind: str, backward: bool, dtype: torch.dtype) -> str:
@@ -68,7 +71,6 @@ def source(kind: str, backward: bool, dtype: torch.dtype) -> str:
     integers = {"BLOCK": BLOCK, "HIDDEN": HIDDEN, "NARROW": NARROW, "FEATURES": FEATURES, "CACHED": CACHED}
     text = "".join(f"    const int {name} = {value};\n" for name, value in integers.items())
     text += f"    const bool ELASTIC = {str(kind == 'elasticity').lower()};\n"
-    text += f"    const bool KEEPS_LAYER = {str(KEEPS_LAYER).lower()};\n"
     text += f"    const Real FLOOR = Real({torch.finfo(dtype).eps ** 0.5!r}), RANGE = Real({RANGE[dtype]!r});\n"
     for name, values in zip(("DISTRIBUTION", "DENSITY"), gelu_polynomials(dtype), strict=True):
         numbers = ", ".join(f"Real({value!r})" for value in values)
