@@ -92,8 +92,8 @@ class NeuralConstitutive(AdaptableConstitutive):
     capturable = True
     native = True
     fused: bool | None = None
-    """Whether evaluate and vjp use :mod:`neural_fused` or :mod:`neural_vector`: False never, True always, None where they
-    are supported."""
+    """Whether evaluate and vjp use :mod:`neural_fused` or :mod:`neural_vector`: False never, True always, None where
+    these are supported."""
 
     def graph_key(self) -> Hashable:
         return type(self), self.fused, self.adjoint_precision
@@ -202,7 +202,8 @@ class NeuralConstitutive(AdaptableConstitutive):
         grad_weights[0].add_((state.z.mT @ back.grad_a).mT)  # faster than the other order of factors
         torch.mm(back.grad_a, pad(W0, (0, PADDED - FEATURES)), out=back.grad_z)
         launch(
-            input_adjoint, len(F), F, state.R, state.Vh, state.z, state.Y, g, back.grad_z[:, :FEATURES], self.scale, grad_F,
+            input_adjoint, len(F), F, state.R, state.Vh, state.z, state.Y, g, back.grad_z[:, :FEATURES], self.scale,
+            grad_F,
         )  # fmt: skip
         return grad_F, grad_weights
 

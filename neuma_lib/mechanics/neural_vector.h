@@ -75,7 +75,7 @@
         }
     };
     // Symmetric matrices as their diagonal and the elements 01, 02 and 12
-    const int ROW_OF[6] = {0, 1, 2, 0, 0, 1}, COLUMN_OF[6] = {0, 1, 2, 1, 2, 2};
+    const int ROW_OF[OUTPUTS] = {0, 1, 2, 0, 0, 1}, COLUMN_OF[OUTPUTS] = {0, 1, 2, 1, 2, 2};
     auto element = [&](int k) { return 3 * ROW_OF[k] + COLUMN_OF[k]; };
     auto mirrored = [&](int k) { return 3 * COLUMN_OF[k] + ROW_OF[k]; };
     auto load = [&](uint64_t array, size_t first, int used, Pack* x) {
@@ -99,13 +99,13 @@
     #define NT 3, 1, 1, 3
     #define TN 1, 3, 3, 1
     // Scratch memory. Weights with merged rows or columns of symmetric pairs, each as left and as right factor.
-    Real* free_memory = (Real*)work;
+    Real* free_memory = (Real*)((work + 127) & ~(uint64_t)127);
     auto take = [&](int count) {
         Real* const here = free_memory;
         free_memory += count;
         return here;
     };
-    Real* const w0_T = take(10 * HIDDEN);      // (10, 64)
+    Real* const w0_T = take(INPUTS * HIDDEN);  // (10, 64)
     Real* const w1_T = take(HIDDEN * HIDDEN);  // (64, 64)
     Real* const w2_T = take(HIDDEN * NARROW);  // (64, 16)
     Real* const z = take(BLOCK * NARROW);      // features, then their gradient
@@ -116,29 +116,29 @@
     const Real* const W1_ = (const Real*)W1;
     const Real* const W2_ = (const Real*)W2;
     for (int o = 0; o < HIDDEN; ++o) {
-        for (int k = 0; k < 10; ++k) {
-            const Real* const w = W0_ + FEATURES * o;
-            const bool pair = k >= 6 && k < 9;
-            w0_T[HIDDEN * k + o] = k < 3 ? w[k] : k == 9 ? w[12] : w[3 + element(k - 3)] +
-                (pair ? w[3 + mirrored(k - 3)] : Real(0));
+        const Real* const w = W0_ + FEATURES * o;
+        for (int k = 0; k < 3; ++k) {
+            w0_T[HIDDEN * k + o] = w[k];
+            w0_T[HIDDEN * (3 + k) + o] = w[3 + element(k)];
+            w0_T[HIDDEN * (6 + k) + o] = w[3 + element(3 + k)] + w[3 + mirrored(3 + k)];
         }
+        w0_T[HIDDEN * 9 + o] = w[12];
         for (int i = 0; i < HIDDEN; ++i) w1_T[HIDDEN * i + o] = W1_[HIDDEN * o + i];
-        for (int k = 0; k < NARROW; ++k) {
-            const Real w = k < 6 ? Real(0.5) * (W2_[HIDDEN * element(k) + o] + W2_[HIDDEN * mirrored(k) + o]) : Real(0);
-            w2_T[NARROW * o + k] = w;
-        }
+        for (int k = 0; k < NARROW; ++k) w2_T[NARROW * o + k] = Real(0);
+        for (int k = 0; k < OUTPUTS; ++k)
+            w2_T[NARROW * o + k] = Real(0.5) * (W2_[HIDDEN * element(k) + o] + W2_[HIDDEN * mirrored(k) + o]);
     }
-    // Features of the packs of a block; kept[21] of a pack receives U, V and s, or has them if `again`
+    // Features of the packs of a block; kept[KEPT] of a pack receives U, V and s, or has them if `again`
     auto features = [&](size_t begin, Pack* kept, bool again) {
-        for (int pack = 0; pack < BLOCK / WIDTH; ++pack, kept += 21) {
+        for (int pack = 0; pack < BLOCK / WIDTH; ++pack, kept += KEPT) {
             const size_t first = begin + pack * WIDTH;
             // lanes after the last row repeat a row, without gradient
             const size_t start = first < (size_t)n ? first : n - 1;
             const int used = n - start < WIDTH ? n - start : WIDTH;
-            Pack a[9], x[10];
+            Pack a[9], x[INPUTS];
             load(F, start, used, a);
             {GRAM}
-            for (int k = 0; k < 6; ++k) x[3 + k] = gram[element(k)] - (k < 3 ? Real(1) : Real(0));
+            for (int k = 0; k < OUTPUTS; ++k) x[3 + k] = gram[element(k)] - (k < 3 ? Real(1) : Real(0));
             x[9] = det - Real(1);
             if (!again) {
                 {SVD}
@@ -154,23 +154,23 @@
             }
             for (int k = 0; k < 3; ++k) x[k] = kept[18 + k] - Real(1);
             for (int l = 0; l < WIDTH; ++l)
-                for (int k = 0; k < 10; ++k) z[NARROW * (pack * WIDTH + l) + k] = LANE(x[k], l);
+                for (int k = 0; k < INPUTS; ++k) z[NARROW * (pack * WIDTH + l) + k] = LANE(x[k], l);
         }
     };
     // R = U V^T and X of a pack
     auto rotation_and_output = [&](int pack, const Pack* kept, Pack* R, Pack* X) {
         matmul(kept, kept + 9, R, 1, 3, 3, 1);
         for (int l = 0; l < WIDTH; ++l)
-            for (int k = 0; k < 6; ++k) LANE(X[element(k)], l) = y[NARROW * (pack * WIDTH + l) + k];
-        for (int k = 3; k < 6; ++k) X[mirrored(k)] = X[element(k)];
+            for (int k = 0; k < OUTPUTS; ++k) LANE(X[element(k)], l) = y[NARROW * (pack * WIDTH + l) + k];
+        for (int k = 3; k < OUTPUTS; ++k) X[mirrored(k)] = X[element(k)];
     };
 
 //// evaluate
-    Pack* const scratch = (Pack*)take(21 * BLOCK);
+    Pack* const scratch = (Pack*)take(KEPT * BLOCK);
     for (size_t begin = 0; begin < (size_t)n; begin += BLOCK) {
-        Pack* const kept = cache ? (Pack*)((Real*)cache + begin * CACHED) : scratch;
+        Pack* const kept = cache ? (Pack*)((Real*)cache + begin * KEPT) : scratch;
         features(begin, kept, false);
-        product(Square(), BLOCK, HIDDEN, 10, z, NARROW, 1, w0_T, h0, false);
+        product(Square(), BLOCK, HIDDEN, INPUTS, z, NARROW, 1, w0_T, h0, false);
         gelu(false, h0, nullptr);
         product(Square(), BLOCK, HIDDEN, HIDDEN, h0, HIDDEN, 1, w1_T, h1, false);
         gelu(false, h1, nullptr);
@@ -180,7 +180,7 @@
             const int used = n - first < WIDTH ? n - first : WIDTH;
             Pack f[9], R[9], X[9], P[9], value[9];
             load(F, first, used, f);
-            rotation_and_output(pack, kept + 21 * pack, R, X);
+            rotation_and_output(pack, kept + KEPT * pack, R, X);
             matmul(R, X, P, NN);
             if (ELASTIC) matmul(P, f, value, NT);
             else for (int k = 0; k < 9; ++k) value[k] = f[k] + scale * P[k];
@@ -189,27 +189,27 @@
     }
 
 //// vjp
-    Real* const w0 = take(HIDDEN * NARROW);   // (64, 16)
-    Real* const w1 = take(HIDDEN * HIDDEN);   // (64, 64)
-    Real* const w2 = take(6 * HIDDEN);        // (6, 64)
+    Real* const w0 = take(HIDDEN * NARROW);  // (64, 16)
+    Real* const w1 = take(HIDDEN * HIDDEN);  // (64, 64)
+    Real* const w2 = take(OUTPUTS * HIDDEN);  // (6, 64)
     Real* const slope0 = take(BLOCK * HIDDEN);
     Real* const slope1 = take(BLOCK * HIDDEN);
     Real* const g0 = take(BLOCK * HIDDEN);
     Real* const g1 = take(BLOCK * HIDDEN);
-    Real* const sum0 = take(10 * HIDDEN);      // gradients of w0_T, w1 and w2
+    Real* const sum0 = take(INPUTS * HIDDEN);  // gradients of w0_T, w1 and w2
     Real* const sum1 = take(HIDDEN * HIDDEN);
-    Real* const sum2 = take(6 * HIDDEN);
-    Pack* const scratch = (Pack*)take(21 * BLOCK);
+    Real* const sum2 = take(OUTPUTS * HIDDEN);
+    Pack* const scratch = (Pack*)take(KEPT * BLOCK);
     for (int o = 0; o < HIDDEN; ++o) {
-        for (int k = 0; k < NARROW; ++k) w0[NARROW * o + k] = k < 10 ? w0_T[HIDDEN * k + o] : Real(0);
-        for (int k = 0; k < 6; ++k) w2[HIDDEN * k + o] = w2_T[NARROW * o + k];
+        for (int k = 0; k < NARROW; ++k) w0[NARROW * o + k] = k < INPUTS ? w0_T[HIDDEN * k + o] : Real(0);
+        for (int k = 0; k < OUTPUTS; ++k) w2[HIDDEN * k + o] = w2_T[NARROW * o + k];
         for (int i = 0; i < HIDDEN; ++i) w1[HIDDEN * o + i] = W1_[HIDDEN * o + i];
     }
-    for (int i = 0; i < HIDDEN * (10 + HIDDEN + 6); ++i) sum0[i] = Real(0);
+    for (int i = 0; i < HIDDEN * (INPUTS + HIDDEN + OUTPUTS); ++i) sum0[i] = Real(0);
     for (size_t begin = 0; begin < (size_t)n; begin += BLOCK) {
-        Pack* const kept = cache ? (Pack*)((Real*)cache + begin * CACHED) : scratch;
+        Pack* const kept = cache ? (Pack*)((Real*)cache + begin * KEPT) : scratch;
         features(begin, kept, cache != 0);
-        product(Square(), BLOCK, HIDDEN, 10, z, NARROW, 1, w0_T, h0, false);
+        product(Square(), BLOCK, HIDDEN, INPUTS, z, NARROW, 1, w0_T, h0, false);
         gelu(true, h0, slope0);
         product(Square(), BLOCK, HIDDEN, HIDDEN, h0, HIDDEN, 1, w1_T, h1, false);
         gelu(true, h1, slope1);
@@ -224,7 +224,7 @@
                 for (int l = used; l < WIDTH; ++l)
                     for (int k = 0; k < 9; ++k) LANE(g[k], l) = Real(0);
             } else for (int k = 0; k < 9; ++k) g[k] = Pack{};
-            rotation_and_output(pack, kept + 21 * pack, R, X);
+            rotation_and_output(pack, kept + KEPT * pack, R, X);
             if (ELASTIC) {
                 Pack f[9];
                 const size_t start = first < (size_t)n ? first : n - 1;
@@ -238,28 +238,28 @@
             }
             matmul(grad_P, X, grad_R[pack], NN);
             matmul(R, grad_P, grad_X, TN);
-            for (int k = 3; k < 6; ++k) grad_X[element(k)] += grad_X[mirrored(k)];
+            for (int k = 3; k < OUTPUTS; ++k) grad_X[element(k)] += grad_X[mirrored(k)];
             for (int l = 0; l < WIDTH; ++l)
-                for (int k = 0; k < 6; ++k) y[NARROW * (pack * WIDTH + l) + k] = LANE(grad_X[element(k)], l);
+                for (int k = 0; k < OUTPUTS; ++k) y[NARROW * (pack * WIDTH + l) + k] = LANE(grad_X[element(k)], l);
         }
-        product(Six(), 6, HIDDEN, BLOCK, y, 1, NARROW, h1, sum2, true);
-        product(Square(), BLOCK, HIDDEN, 6, y, NARROW, 1, w2, g1, false);
+        product(Six(), OUTPUTS, HIDDEN, BLOCK, y, 1, NARROW, h1, sum2, true);
+        product(Square(), BLOCK, HIDDEN, OUTPUTS, y, NARROW, 1, w2, g1, false);
         for (int i = 0; i < BLOCK * HIDDEN / SPAN; ++i) ((Vector*)g1)[i] *= ((Vector*)slope1)[i];
         product(Square(), HIDDEN, HIDDEN, BLOCK, g1, 1, HIDDEN, h0, sum1, true);
         product(Square(), BLOCK, HIDDEN, HIDDEN, g1, HIDDEN, 1, w1, g0, false);
         for (int i = 0; i < BLOCK * HIDDEN / SPAN; ++i) ((Vector*)g0)[i] *= ((Vector*)slope0)[i];
-        product(Five(), 10, HIDDEN, BLOCK, z, 1, NARROW, g0, sum0, true);
+        product(Five(), INPUTS, HIDDEN, BLOCK, z, 1, NARROW, g0, sum0, true);
         product(Narrow(), BLOCK, NARROW, HIDDEN, g0, HIDDEN, 1, w0, z, false);
         for (int pack = 0; pack < BLOCK / WIDTH && begin + pack * WIDTH < (size_t)n; ++pack) {
             const size_t first = begin + pack * WIDTH;
             const int used = n - first < WIDTH ? n - first : WIDTH;
-            const Pack* const u = kept + 21 * pack;
+            const Pack* const u = kept + KEPT * pack;
             const Pack* const v = u + 9;
             const Pack* const s = v + 9;
-            Pack f[9], gz[10], M[9], T[9], K[9], G[9];
+            Pack f[9], gz[INPUTS], M[9], T[9], K[9], G[9];
             load(F, first, used, f);
             for (int l = 0; l < WIDTH; ++l)
-                for (int k = 0; k < 10; ++k) LANE(gz[k], l) = z[NARROW * (pack * WIDTH + l) + k];
+                for (int k = 0; k < INPUTS; ++k) LANE(gz[k], l) = z[NARROW * (pack * WIDTH + l) + k];
             // rotation and singular values: U K V^T, K_ij = (M_ij - M_ji) / (s_i + s_j), M = U^T grad_R V
             matmul(u, grad_R[pack], T, NN);
             matmul(T, v, M, NT);
@@ -277,7 +277,7 @@
             matmul(T, v, M, NN);
             // F^T F: F (G + G^T)
             for (int k = 0; k < 3; ++k) G[4 * k] = gz[3 + k] + gz[3 + k];
-            for (int k = 3; k < 6; ++k) G[element(k)] = G[mirrored(k)] = gz[3 + k];
+            for (int k = 3; k < OUTPUTS; ++k) G[element(k)] = G[mirrored(k)] = gz[3 + k];
             matmul(f, G, T, NN);
             // det F: cofactors
             for (int i = 0; i < 3; ++i)
@@ -293,16 +293,18 @@
     Real* const G1 = (Real*)total1;
     Real* const G2 = (Real*)total2;
     for (int o = 0; o < HIDDEN; ++o) {
-        for (int k = 0; k < 3; ++k) G0[FEATURES * o + k] += sum0[HIDDEN * k + o];
-        for (int k = 0; k < 6; ++k) {
-            G0[FEATURES * o + 3 + element(k)] += sum0[HIDDEN * (3 + k) + o];
-            if (k >= 3) G0[FEATURES * o + 3 + mirrored(k)] += sum0[HIDDEN * (3 + k) + o];
+        Real* const w = G0 + FEATURES * o;
+        for (int k = 0; k < 3; ++k) {
+            const Real pair = sum0[HIDDEN * (6 + k) + o], half = Real(0.5) * sum2[HIDDEN * (3 + k) + o];
+            w[k] += sum0[HIDDEN * k + o];
+            w[3 + element(k)] += sum0[HIDDEN * (3 + k) + o];
+            w[3 + element(3 + k)] += pair;
+            w[3 + mirrored(3 + k)] += pair;
+            G2[HIDDEN * element(k) + o] += sum2[HIDDEN * k + o];
+            G2[HIDDEN * element(3 + k) + o] += half;
+            G2[HIDDEN * mirrored(3 + k) + o] += half;
         }
-        G0[FEATURES * o + 12] += sum0[HIDDEN * 9 + o];
-        for (int k = 0; k < 6; ++k) {
-            G2[HIDDEN * element(k) + o] += (k < 3 ? Real(1) : Real(0.5)) * sum2[HIDDEN * k + o];
-            if (k >= 3) G2[HIDDEN * mirrored(k) + o] += Real(0.5) * sum2[HIDDEN * k + o];
-        }
+        w[12] += sum0[HIDDEN * 9 + o];
     }
     for (int i = 0; i < HIDDEN * HIDDEN; ++i) G1[i] += sum1[i];
 

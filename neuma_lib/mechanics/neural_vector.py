@@ -16,7 +16,7 @@ import warp as wp
 from torch import Tensor
 
 from neuma_lib.device import native_source
-from neuma_lib.mechanics.analytic_kernels import CPU_WIDTH
+from neuma_lib.mechanics.analytic_kernels import CPU_WIDTH, KEPT
 from neuma_lib.mechanics.fused_launch import contiguous, launch_blocks
 from neuma_lib.mechanics.law import Weights
 from neuma_lib.mechanics.neural_kernels import FEATURES, GRAM
@@ -24,14 +24,22 @@ from neuma_lib.mechanics.singular_values_kernels import END, FUSE, SVD, TYPES, f
 
 BLOCK = 64
 """Rows per block."""
-HIDDEN, NARROW = 64, 16
-CACHED = 21
-"""Numbers per row in a cache: U, V and the singular values. To read activations takes longer than to compute them."""
+HIDDEN = 64
+INPUTS, OUTPUTS = 10, 6
+"""Columns of the first and rows of the last layer, with one for each pair of equal features or outputs."""
+NARROW = 16
+"""Columns of a matrix of inputs or outputs: those of a vector, the last ones unused."""
 RANGE = {torch.float32: 5.75, torch.float64: 8.3}
 """|x| from which the standard normal distribution is constant to round-off."""
 TERMS = {torch.float32: (16, 6), torch.float64: (36, 12)}
 """Coefficients of the polynomials for the distribution and the density, for an error of round-off."""
-SCRATCH = 2 * HIDDEN * (10 + HIDDEN + NARROW) + HIDDEN * (HIDDEN + 20) + BLOCK * (2 * NARROW + 6 * HIDDEN + 21)
+SCRATCH = (
+    HIDDEN * (2 * (INPUTS + HIDDEN) + NARROW)  # factors of the forward pass, and of the sums of gradients
+    + HIDDEN * (NARROW + HIDDEN + 2 * OUTPUTS)  # factors of the backward pass
+    + BLOCK * (2 * NARROW + 6 * HIDDEN + KEPT)
+    + 32  # alignment
+)
+"""Numbers that a kernel uses for intermediate values."""
 
 
 def chebyshev(function: Callable[[float], float], low: float, high: float, terms: int) -> list[float]:
@@ -54,8 +62,8 @@ def chebyshev(function: Callable[[float], float], low: float, high: float, terms
 
 @cache
 def gelu_polynomials(dtype: torch.dtype) -> tuple[list[float], list[float]]:
-    """Polynomials in t = 2 (x / RANGE)^2 - 1 for (Phi(x) - 1/2) / x, with the standard normal distribution Phi, and in r,
-    |r| <= 1/2, for 2^r / sqrt(2 pi)."""
+    """Polynomials for GELU, with the standard normal distribution Phi: in t = 2 (x / RANGE)^2 - 1 for
+    (Phi(x) - 1/2) / x, and in r, |r| <= 1/2, for 2^r / sqrt(2 pi)."""
     terms = TERMS[dtype]
     distribution = chebyshev(
         lambda u: math.erf(math.sqrt(0.5 * u)) / (2 * math.sqrt(u)), 0.0, RANGE[dtype] ** 2, terms[0]
@@ -68,10 +76,13 @@ def gelu_polynomials(dtype: torch.dtype) -> tuple[list[float], list[float]]:
 def source(kind: str, backward: bool, dtype: torch.dtype) -> str:
     """C++ source of the body of a kernel for ``kind`` "elasticity" or "plasticity"."""
     parts = native_source(__file__, ".h")
-    integers = {"BLOCK": BLOCK, "HIDDEN": HIDDEN, "NARROW": NARROW, "FEATURES": FEATURES, "CACHED": CACHED}
+    integers = {"BLOCK": BLOCK, "HIDDEN": HIDDEN, "NARROW": NARROW, "FEATURES": FEATURES}
+    integers |= {"INPUTS": INPUTS, "OUTPUTS": OUTPUTS, "KEPT": KEPT}
     text = "".join(f"    const int {name} = {value};\n" for name, value in integers.items())
     text += f"    const bool ELASTIC = {str(kind == 'elasticity').lower()};\n"
-    text += f"    const Real FLOOR = Real({torch.finfo(dtype).eps ** 0.5!r}), RANGE = Real({RANGE[dtype]!r});\n"
+    text += (
+        f"    const Real FLOOR = Real({torch.finfo(dtype).eps ** 0.5!r}), RANGE = Real({RANGE[dtype]!r});\n"
+    )
     for name, values in zip(("DISTRIBUTION", "DENSITY"), gelu_polynomials(dtype), strict=True):
         numbers = ", ".join(f"Real({value!r})" for value in values)
         text += f"    const Real {name}[{len(values)}] = {{{numbers}}};\n"
@@ -137,12 +148,13 @@ def _scratch(F: Tensor) -> Tensor:
 
 
 def supported(device: torch.device, dtype: torch.dtype) -> bool:
+    """Whether these kernels run: on a CPU."""
     return device.type == "cpu" and dtype in RANGE
 
 
 def new_cache(F: Tensor) -> Tensor:
-    """Memory (blocks, CACHED BLOCK) for the SVD of F (n, 3, 3)."""
-    return F.new_empty(-(-len(F) // BLOCK), CACHED * BLOCK)
+    """Memory (blocks, KEPT BLOCK) for the SVD of F (n, 3, 3). Activations are recomputed, which is faster."""
+    return F.new_empty(-(-len(F) // BLOCK), KEPT * BLOCK)
 
 
 @torch.no_grad()
