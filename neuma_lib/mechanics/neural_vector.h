@@ -182,7 +182,7 @@
             load(F, first, used, f);
             rotation_and_output(pack, kept + KEPT * pack, R, X);
             matmul(R, X, P, NN);
-            if (ELASTIC) matmul(P, f, value, NT);
+            if (elastic) matmul(P, f, value, NT);
             else for (int k = 0; k < 9; ++k) value[k] = f[k] + scale * P[k];
             store(out, first, used, value);
         }
@@ -225,7 +225,7 @@
                     for (int k = 0; k < 9; ++k) LANE(g[k], l) = Real(0);
             } else for (int k = 0; k < 9; ++k) g[k] = Pack{};
             rotation_and_output(pack, kept + KEPT * pack, R, X);
-            if (ELASTIC) {
+            if (elastic) {
                 Pack f[9];
                 const size_t start = first < (size_t)n ? first : n - 1;
                 load(F, start, n - start < WIDTH ? n - start : WIDTH, f);

@@ -73,13 +73,12 @@ def gelu_polynomials(dtype: torch.dtype) -> tuple[list[float], list[float]]:
     return distribution, [c * 2**power for c, power in zip(density, powers, strict=True)]
 
 
-def source(kind: str, backward: bool, dtype: torch.dtype) -> str:
-    """C++ source of the body of a kernel for ``kind`` "elasticity" or "plasticity"."""
+def source(backward: bool, dtype: torch.dtype) -> str:
+    """C++ source of the body of a kernel. ``elastic`` is 1 for elasticity and 0 for plasticity."""
     parts = native_source(__file__, ".h")
     integers = {"BLOCK": BLOCK, "HIDDEN": HIDDEN, "NARROW": NARROW, "FEATURES": FEATURES}
     integers |= {"INPUTS": INPUTS, "OUTPUTS": OUTPUTS, "KEPT": KEPT}
     text = "".join(f"    const int {name} = {value};\n" for name, value in integers.items())
-    text += f"    const bool ELASTIC = {str(kind == 'elasticity').lower()};\n"
     text += (
         f"    const Real FLOOR = Real({torch.finfo(dtype).eps ** 0.5!r}), RANGE = Real({RANGE[dtype]!r});\n"
     )
@@ -92,46 +91,46 @@ def source(kind: str, backward: bool, dtype: torch.dtype) -> str:
 
 
 @cache
-def evaluate_kernel(kind: str, dtype: torch.dtype):
-    """Kernel (F, W0, W1, W2, scale, n, cache, out, work), launched by `launch_blocks`."""
+def evaluate_kernel(dtype: torch.dtype):
+    """Kernel (F, W0, W1, W2, elastic, scale, n, cache, out, work), launched by `launch_blocks`."""
     real, _, _ = warp_types(dtype)
 
-    @wp.func_native(source(kind, False, dtype))
+    @wp.func_native(source(False, dtype))
     def evaluate_rows(
-        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, scale: real, n: int, cache: wp.uint64,
+        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, elastic: int, scale: real, n: int, cache: wp.uint64,
         out: wp.uint64, work: wp.uint64,
     ): ...  # fmt: skip
 
     @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
     def neural_vector_evaluate(
-        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, scale: real, n: int, cache: wp.uint64,
+        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, elastic: int, scale: real, n: int, cache: wp.uint64,
         out: wp.uint64, work: wp.uint64,
     ):  # fmt: skip
-        evaluate_rows(F, W0, W1, W2, scale, n, cache, out, work)
+        evaluate_rows(F, W0, W1, W2, elastic, scale, n, cache, out, work)
 
     return neural_vector_evaluate
 
 
 @cache
-def vjp_kernel(kind: str, dtype: torch.dtype):
-    """Kernel (F, W0, W1, W2, scale, n, cache, grad_out, grad_F, total0, total1, total2, work), launched by
+def vjp_kernel(dtype: torch.dtype):
+    """Kernel (F, W0, W1, W2, elastic, scale, n, cache, grad_out, grad_F, total0, total1, total2, work), launched by
     `launch_blocks`. It adds the gradients of the weights to the totals."""
     real, _, _ = warp_types(dtype)
 
-    @wp.func_native(source(kind, True, dtype))
+    @wp.func_native(source(True, dtype))
     def vjp_rows(
-        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, scale: real, n: int, cache: wp.uint64,
+        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, elastic: int, scale: real, n: int, cache: wp.uint64,
         grad_out: wp.uint64, grad_F: wp.uint64, total0: wp.uint64, total1: wp.uint64, total2: wp.uint64,
         work: wp.uint64,
     ): ...  # fmt: skip
 
     @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
     def neural_vector_vjp(
-        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, scale: real, n: int, cache: wp.uint64,
+        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, elastic: int, scale: real, n: int, cache: wp.uint64,
         grad_out: wp.uint64, grad_F: wp.uint64, total0: wp.uint64, total1: wp.uint64, total2: wp.uint64,
         work: wp.uint64,
     ):  # fmt: skip
-        vjp_rows(F, W0, W1, W2, scale, n, cache, grad_out, grad_F, total0, total1, total2, work)
+        vjp_rows(F, W0, W1, W2, elastic, scale, n, cache, grad_out, grad_F, total0, total1, total2, work)
 
     return neural_vector_vjp
 
@@ -173,8 +172,8 @@ def evaluate(
     with contiguous(out) as (result,):
         if len(F):
             W = [w.detach().contiguous() for w in weights]
-            inputs = F, *W, scale, len(F), cache, result, _scratch(F)
-            launch_blocks(evaluate_kernel(kind, F.dtype), 1, 1, *inputs)
+            inputs = F, *W, int(kind == "elasticity"), scale, len(F), cache, result, _scratch(F)
+            launch_blocks(evaluate_kernel(F.dtype), 1, 1, *inputs)
     return out
 
 
@@ -196,6 +195,17 @@ def vjp(
     with contiguous(grad_F, *totals) as (result, *sums):
         if len(F):
             W = [w.detach().contiguous() for w in weights]
-            inputs = F, *W, scale, len(F), cache, grad_out, result, *sums, _scratch(F)
-            launch_blocks(vjp_kernel(kind, F.dtype), 1, 1, *inputs)
+            inputs = (
+                F,
+                *W,
+                int(kind == "elasticity"),
+                scale,
+                len(F),
+                cache,
+                grad_out,
+                result,
+                *sums,
+                _scratch(F),
+            )
+            launch_blocks(vjp_kernel(F.dtype), 1, 1, *inputs)
     return grad_F, totals
