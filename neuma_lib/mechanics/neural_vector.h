@@ -128,7 +128,7 @@
         for (int k = 0; k < OUTPUTS; ++k)
             w2_T[NARROW * o + k] = Real(0.5) * (W2_[HIDDEN * element(k) + o] + W2_[HIDDEN * mirrored(k) + o]);
     }
-    // Features of the packs of a block; kept[KEPT] of a pack receives U, V and s, or has them if `again`
+    // Features of the packs of a block. kept[KEPT] of a pack receives U, V, s and X, or has them if `again`.
     auto features = [&](size_t begin, Pack* kept, bool again) {
         for (int pack = 0; pack < BLOCK / WIDTH; ++pack, kept += KEPT) {
             const size_t first = begin + pack * WIDTH;
@@ -157,12 +157,13 @@
                 for (int k = 0; k < INPUTS; ++k) z[NARROW * (pack * WIDTH + l) + k] = LANE(x[k], l);
         }
     };
-    // R = U V^T and X of a pack
-    auto rotation_and_output = [&](int pack, const Pack* kept, Pack* R, Pack* X) {
+    // R = U V^T and X of a pack, as for `features`
+    auto rotation_and_output = [&](int pack, Pack* kept, bool again, Pack* R, Pack* X) {
         matmul(kept, kept + 9, R, 1, 3, 3, 1);
-        for (int l = 0; l < WIDTH; ++l)
-            for (int k = 0; k < OUTPUTS; ++k) LANE(X[element(k)], l) = y[NARROW * (pack * WIDTH + l) + k];
-        for (int k = 3; k < OUTPUTS; ++k) X[mirrored(k)] = X[element(k)];
+        if (!again)
+            for (int l = 0; l < WIDTH; ++l)
+                for (int k = 0; k < OUTPUTS; ++k) LANE(kept[21 + k], l) = y[NARROW * (pack * WIDTH + l) + k];
+        for (int k = 0; k < OUTPUTS; ++k) X[element(k)] = X[mirrored(k)] = kept[21 + k];
     };
 
 //// evaluate
@@ -180,7 +181,7 @@
             const int used = n - first < WIDTH ? n - first : WIDTH;
             Pack f[9], R[9], X[9], P[9], value[9];
             load(F, first, used, f);
-            rotation_and_output(pack, kept + KEPT * pack, R, X);
+            rotation_and_output(pack, kept + KEPT * pack, false, R, X);
             matmul(R, X, P, NN);
             if (elastic) matmul(P, f, value, NT);
             else for (int k = 0; k < 9; ++k) value[k] = f[k] + scale * P[k];
@@ -213,7 +214,7 @@
         gelu(true, h0, slope0);
         product(Square(), BLOCK, HIDDEN, HIDDEN, h0, HIDDEN, 1, w1_T, h1, false);
         gelu(true, h1, slope1);
-        product(Narrow(), BLOCK, NARROW, HIDDEN, h1, HIDDEN, 1, w2_T, y, false);
+        if (!cache) product(Narrow(), BLOCK, NARROW, HIDDEN, h1, HIDDEN, 1, w2_T, y, false);
         Pack direct[BLOCK / WIDTH][9], grad_R[BLOCK / WIDTH][9];
         for (int pack = 0; pack < BLOCK / WIDTH; ++pack) {
             const size_t first = begin + pack * WIDTH;
@@ -224,7 +225,7 @@
                 for (int l = used; l < WIDTH; ++l)
                     for (int k = 0; k < 9; ++k) LANE(g[k], l) = Real(0);
             } else for (int k = 0; k < 9; ++k) g[k] = Pack{};
-            rotation_and_output(pack, kept + KEPT * pack, R, X);
+            rotation_and_output(pack, kept + KEPT * pack, cache != 0, R, X);
             if (elastic) {
                 Pack f[9];
                 const size_t start = first < (size_t)n ? first : n - 1;

@@ -16,7 +16,7 @@ import warp as wp
 from torch import Tensor
 
 from neuma_lib.device import native_source
-from neuma_lib.mechanics.analytic_kernels import CPU_WIDTH, KEPT
+from neuma_lib.mechanics.analytic_kernels import CPU_WIDTH
 from neuma_lib.mechanics.fused_launch import contiguous, launch_blocks
 from neuma_lib.mechanics.law import Weights
 from neuma_lib.mechanics.neural_kernels import FEATURES, GRAM
@@ -27,6 +27,8 @@ BLOCK = 64
 HIDDEN = 64
 INPUTS, OUTPUTS = 10, 6
 """Columns of the first and rows of the last layer, with one for each pair of equal features or outputs."""
+KEPT = 27
+"""Numbers per row in a cache: U, V, the singular values and X. Activations are recomputed, which is faster."""
 NARROW = 16
 """Columns of a matrix of inputs or outputs: those of a vector, the last ones unused."""
 RANGE = {torch.float32: 5.75, torch.float64: 8.3}
@@ -152,7 +154,7 @@ def supported(device: torch.device, dtype: torch.dtype) -> bool:
 
 
 def new_cache(F: Tensor) -> Tensor:
-    """Memory (blocks, KEPT BLOCK) for the SVD of F (n, 3, 3). Activations are recomputed, which is faster."""
+    """Memory (blocks, KEPT BLOCK) for the SVD and the outputs of F (n, 3, 3)."""
     return F.new_empty(-(-len(F) // BLOCK), KEPT * BLOCK)
 
 
@@ -165,8 +167,10 @@ def evaluate(
     out: Tensor | None = None,
     cache: Tensor | None = None,
 ) -> Tensor:
-    """Evaluate the law of ``kind`` at F (n, 3, 3), plasticity as F + scale R X, and store the SVD in ``cache`` if
-    given. See `Constitutive`."""
+    """Evaluate the law of ``kind`` at F (n, 3, 3), plasticity as F + scale R X. Fills ``cache`` if given.
+
+    See `Constitutive`.
+    """
     F = F.detach().contiguous()
     out = torch.empty_like(F) if out is None else out
     with contiguous(out) as (result,):
