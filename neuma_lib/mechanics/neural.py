@@ -8,8 +8,8 @@ A network of three layers without bias, 13 -> 64 -> 64 -> 9 with GELU activation
 
 Zero features give zero output because there is no bias, so rotations are stress-free. R makes both maps objective.
 
-:mod:`neural_fused` has faster kernels for float32 on recent GPUs. This module covers all other cases and is the
-reference implementation of those kernels.
+:mod:`neural_vector` has faster kernels for a CPU and :mod:`neural_fused` for float32 on recent GPUs. This module covers
+all other cases and is the reference implementation of those kernels.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from torch.nn.functional import gelu, pad
 
 from neuma_lib.device import launch
 from neuma_lib.errors import InputError
-from neuma_lib.mechanics import neural_fused
+from neuma_lib.mechanics import neural_fused, neural_vector
 from neuma_lib.mechanics.adaptor import AdaptableConstitutive, AdaptableLaw, layers_of
 from neuma_lib.mechanics.law import Elasticity, Plasticity, Weights
 from neuma_lib.mechanics.neural_kernels import FEATURES, feature_kernel, output_kernels
@@ -33,8 +33,6 @@ from neuma_lib.mechanics.singular_values_kernels import CPU_WIDTH, pack_count
 WIDTH = 64
 SHAPES = ((WIDTH, FEATURES), (WIDTH, WIDTH), (9, WIDTH))
 PLASTIC_SCALE = 1e-3
-CPU_ROWS = 2048
-"""Rows per matrix product on the CPU, so that operands fit into the cache."""
 PADDED = 16
 """Columns of the gradient of the features. BLAS is four times faster with 16 than with 13."""
 
@@ -94,7 +92,8 @@ class NeuralConstitutive(AdaptableConstitutive):
     capturable = True
     native = True
     fused: bool | None = None
-    """Whether evaluate and vjp use :mod:`neural_fused`: False never, True always, None where it is supported."""
+    """Whether evaluate and vjp use :mod:`neural_fused` or :mod:`neural_vector`: False never, True always, None where
+    these are supported."""
 
     def graph_key(self) -> Hashable:
         return type(self), self.fused, self.adjoint_precision
@@ -121,29 +120,34 @@ class NeuralConstitutive(AdaptableConstitutive):
         return R @ X @ F.mT if self.kind == "elasticity" else F + self.scale * (R @ X)
 
     def uses_fused(self, F: Tensor) -> bool:
-        """Whether the fused kernels evaluate F, depending on its device, its dtype and :attr:`fused`."""
-        return neural_fused.supported(F.device, F.dtype) if self.fused is None else self.fused
+        """Whether fused kernels evaluate F, depending on its device, its dtype and :attr:`fused`."""
+        kernels = neural_vector if F.device.type == "cpu" else neural_fused
+        return kernels.supported(F.device, F.dtype) if self.fused is None else self.fused
 
     def evaluate(self, F: Tensor, weights: Weights, out: Tensor | None = None) -> Tensor:
         if not self.uses_fused(F):
             return self._evaluate(F, weights, out)
-        return neural_fused.evaluate(F, weights, self.kind, self.scale, out)
+        kernels = neural_vector if F.device.type == "cpu" else neural_fused
+        return kernels.evaluate(F, weights, self.kind, self.scale, out)
 
     def evaluate_with_cache(self, F, weights, out=None, cache=None):
-        if self.uses_fused(F):
+        if not self.uses_fused(F):
+            cache = cache or _Forward(F)
+            return self._evaluate(F, weights, out, cache), cache
+        if F.device.type != "cpu":
             return self.evaluate(F, weights, out), None
-        cache = cache or [_Forward(F[rows]) for rows in _chunks(F)]
-        return self._evaluate(F, weights, out, cache), cache
+        cache = neural_vector.new_cache(F) if cache is None else cache
+        return neural_vector.evaluate(F, weights, self.kind, self.scale, out, cache), cache
 
     @torch.no_grad()
-    def _evaluate(self, F, weights, out, states=None):
+    def _evaluate(self, F, weights, out, state=None):
         F = F.detach().contiguous()
         out = torch.empty_like(F) if out is None else out
         result, _, _ = output_kernels(F.dtype, self.kind)
-        for index, rows in enumerate(_chunks(F)):
-            state = states[index] if states else _scratch.get(_Forward, F[rows])
-            self._network(F[rows], weights, state)
-            launch(result, len(state.z), F[rows], state.R, state.Y, self.scale, out[rows])
+        if len(F):
+            state = state or _scratch.get(_Forward, F)
+            self._network(F, weights, state)
+            launch(result, len(F), F, state.R, state.Y, self.scale, out)
         return out
 
     def _network(self, F: Tensor, weights: Weights, state: _Forward) -> None:
@@ -158,7 +162,8 @@ class NeuralConstitutive(AdaptableConstitutive):
         torch.mm(state.h1, W2.mT, out=state.Y.view(-1, 9))
 
     def accumulators(self, F, grad_weights):
-        return (neural_fused.partial_sums(F),) if self.uses_fused(F) else grad_weights
+        sums_blocks = F.device.type != "cpu" and self.uses_fused(F)
+        return (neural_fused.partial_sums(F),) if sums_blocks else grad_weights
 
     @torch.no_grad()
     def add_up(self, accumulators, weights, grad_weights):
@@ -167,43 +172,40 @@ class NeuralConstitutive(AdaptableConstitutive):
 
     @torch.no_grad()
     def vjp(self, F, weights, grad_out, cache=None, grad_F=None, grad_weights=None):
-        if cache is None and self.uses_fused(F):
+        if self.uses_fused(F):
+            if F.device.type == "cpu":
+                grads = (cache, grad_F, grad_weights)
+                return neural_vector.vjp(F, weights, grad_out, self.kind, self.scale, *grads)
             grads = (grad_F, grad_weights, self.adjoint_precision)
             return neural_fused.vjp(F, weights, grad_out, self.kind, self.scale, *grads)
-        F, grad_out = F.detach().contiguous(), grad_out.contiguous()
+        F, g = F.detach().contiguous(), grad_out.contiguous()
         weights = tuple(w.detach() for w in weights)
         grad_F = torch.empty_like(F) if grad_F is None else grad_F
         if grad_weights is None:
             grad_weights = tuple(torch.zeros_like(w) for w in weights)
+        if not len(F):
+            return grad_F, grad_weights
         _, output_adjoint, input_adjoint = output_kernels(F.dtype, self.kind)
         W0, W1, W2 = weights
-        padded_W0 = pad(W0, (0, PADDED - FEATURES))
-        for index, rows in enumerate(_chunks(F)):
-            part, g = F[rows], grad_out[rows]
-            state = _scratch.get(_Forward, part) if cache is None else cache[index]
-            if cache is None:
-                self._network(part, weights, state)
-            back = _scratch.get(_Backward, part)
-            launch(output_adjoint, len(part), part, state.R, g, self.scale, back.grad_Y)
-            grad_Y = back.grad_Y.view(-1, 9)
-            grad_weights[2].addmm_(grad_Y.mT, state.h1)
-            torch.mm(grad_Y, W2, out=back.grad_h)
-            aten.gelu_backward.grad_input(back.grad_h, state.a1, grad_input=back.grad_a)
-            grad_weights[1].addmm_(back.grad_a.mT, state.h0)
-            torch.mm(back.grad_a, W1, out=back.grad_h)
-            aten.gelu_backward.grad_input(back.grad_h, state.a0, grad_input=back.grad_a)
-            grad_weights[0].add_((state.z.mT @ back.grad_a).mT)  # faster than the other order of factors
-            torch.mm(back.grad_a, padded_W0, out=back.grad_z)
-            launch(
-                input_adjoint, len(part), part, state.R, state.Vh, state.z, state.Y, g,
-                back.grad_z[:, :FEATURES], self.scale, grad_F[rows],
-            )  # fmt: skip
+        state = _scratch.get(_Forward, F) if cache is None else cache
+        if cache is None:
+            self._network(F, weights, state)
+        back = _scratch.get(_Backward, F)
+        launch(output_adjoint, len(F), F, state.R, g, self.scale, back.grad_Y)
+        grad_Y = back.grad_Y.view(-1, 9)
+        grad_weights[2].addmm_(grad_Y.mT, state.h1)
+        torch.mm(grad_Y, W2, out=back.grad_h)
+        aten.gelu_backward.grad_input(back.grad_h, state.a1, grad_input=back.grad_a)
+        grad_weights[1].addmm_(back.grad_a.mT, state.h0)
+        torch.mm(back.grad_a, W1, out=back.grad_h)
+        aten.gelu_backward.grad_input(back.grad_h, state.a0, grad_input=back.grad_a)
+        grad_weights[0].add_((state.z.mT @ back.grad_a).mT)  # faster than the other order of factors
+        torch.mm(back.grad_a, pad(W0, (0, PADDED - FEATURES)), out=back.grad_z)
+        launch(
+            input_adjoint, len(F), F, state.R, state.Vh, state.z, state.Y, g, back.grad_z[:, :FEATURES], self.scale,
+            grad_F,
+        )  # fmt: skip
         return grad_F, grad_weights
-
-
-def _chunks(F: Tensor) -> list[slice]:
-    size = CPU_ROWS if F.device.type == "cpu" else max(len(F), 1)
-    return [slice(i, min(i + size, len(F))) for i in range(0, len(F), size)]
 
 
 class NeuralElasticity(NeuralConstitutive, Elasticity):

@@ -14,7 +14,7 @@ from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.catalogue import lame
 from neuma_lib.mechanics.elasticity import ELASTICITIES, Hencky, Tait
 from neuma_lib.mechanics.law import Constitutive, Law
-from neuma_lib.mechanics.neural import CPU_ROWS, SHAPES, neural_law
+from neuma_lib.mechanics.neural import SHAPES, neural_law
 from neuma_lib.mechanics.plasticity import (
     DruckerPrager,
     FluidProjection,
@@ -434,10 +434,12 @@ def test_constants_given_as_tensors_are_fitted():
 
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("kind", ["elasticity", "plasticity"])
-@pytest.mark.parametrize("count", [1, 33, CPU_ROWS + 5])
-def test_network_equals_its_torch_twin(kind, count, dtype):
-    """Hand-written forward and adjoint, with and without cache, against autograd through the obvious code."""
+@pytest.mark.parametrize("count", [1, 33, 2053])
+@pytest.mark.parametrize("fused", [None, False])
+def test_network_equals_its_torch_twin(kind, fused, count, dtype):
+    """Both hand-written forms and their adjoints, with and without cache, against autograd through the obvious code."""
     part = getattr(neural_law(seed=2), kind)
+    part.fused = fused
     F = deformations(count).to(dtype)
     probe = torch.randn(F.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(dtype)
     weights = weights_of(part, dtype)
