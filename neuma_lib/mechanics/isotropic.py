@@ -191,7 +191,10 @@ class Constants(nn.Module):
         fitted ones if given."""
         values = self.with_weights(weights) if weights else self.values
         device = next((w.device for w in weights), None)
-        tensors = {key: torch.as_tensor(x, dtype=torch.float64, device=device) for key, x in values.items()}
+        tensors = {
+            key: torch.as_tensor(x, dtype=torch.float64, device=device).reshape(())
+            for key, x in values.items()
+        }
         return kernels.row(type(self).__name__, self.coefficients(**tensors))
 
     @property

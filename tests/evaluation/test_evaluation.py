@@ -135,9 +135,10 @@ def test_a_diverging_motion_keeps_its_last_finite_frame():
         values = getattr(path, name)
         assert torch.isfinite(values).all()
         assert torch.equal(values[2], values[1]) and torch.equal(values[3], values[1])
-    assert torch.equal(path.x[:2], sound.x) and torch.equal(path.F[:2], sound.F)
+    for name in ("x", "F"):  # to rounding, since a law without a kernel is evaluated by torch
+        torch.testing.assert_close(getattr(path, name)[:2], getattr(sound, name), rtol=0, atol=1e-12)
     errors = result["tracer_rmse_mm_per_frame"]
-    assert errors[:2] == [0, 0]
+    assert errors[:2] == pytest.approx([0, 0], abs=1e-9)
     expected = 1e3 * (truth[1] - truth[3]).square().sum(-1).mean().sqrt()  # the truth goes on
     assert errors[3] == pytest.approx(float(expected)) and errors[3] > errors[2] > 1
 

@@ -477,7 +477,9 @@ def test_a_stage_depends_on_its_own_settings_alone():
 
 
 def test_every_section_and_key_is_explained():
-    for kind in Section.__subclasses__():
+    kinds = [kind for kind in Section.__subclasses__() if kind.__module__.startswith("neuma_lib.config.")]
+    assert len(kinds) > 20
+    for kind in kinds:
         assert kind.__doc__ and all(entry.description for entry in kind.model_fields.values()), kind.__name__
 
 
