@@ -14,6 +14,10 @@ from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.fitting.families import FRICTION, Family
 from neuma_lib.mechanics.combinations import Values, named_combinations, physical
 
+_ASYMPTOTIC = math.log(
+    2
+)  # largest change of a logarithm or logit between grids that the order of convergence explains
+
 
 @dataclass
 class FamilyFit:
@@ -76,7 +80,8 @@ class FamilyFit:
 
         Errors of the unbounded constants decrease with dx (thin limbs, layers near the floor) or with dx^2 (smooth
         motion). The result is the limit of second order. Its covariance is increased by the square of the distance to
-        the limit of first order.
+        the limit of first order. A constant that changes by more than `_ASYMPTOTIC` between the grids is not
+        extrapolated further than one that changes by as much.
         """
         u = self.family.unbounded
         change = u(self.values) - u(coarse.values)
@@ -84,6 +89,7 @@ class FamilyFit:
         covariance, remainder = self.covariance, first - second
         if covariance is not None:
             covariance = covariance + np.outer(remainder, remainder)
+        second *= _ASYMPTOTIC / np.maximum(np.abs(change), _ASYMPTOTIC)
         return replace(self, values=self.family.bounded(u(self.values) + second), covariance=covariance)
 
     def log_covariance(self, of: Callable[[Values], Values]) -> tuple[list[str], np.ndarray]:

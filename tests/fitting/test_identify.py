@@ -263,6 +263,10 @@ def test_an_extrapolation_covers_both_orders_of_convergence(refinement):
         error, std = math.log(fine.values["E"] / 1e5), math.sqrt(fine.covariance[0, 0] - 1e-6)
         assert abs(error) == pytest.approx(deviations * std, rel=1e-6, abs=1e-9) and std > 1e-3
         assert fine.values["nu"] == pytest.approx(0.3) and fine.covariance[1, 1] == pytest.approx(1e-6)
+    far = fit(-math.log(9), 1e-6 * np.eye(2)).extrapolated(fit(0.0), refinement)
+    limited = -math.log(9) - math.log(2) / (refinement**2 - 1)
+    assert math.log(far.values["E"] / 1e5) == pytest.approx(limited)
+    assert far.covariance[0, 0] > 0.5 * (math.log(9) / refinement) ** 2
 
 
 def test_a_motion_is_read_moved_and_written():
