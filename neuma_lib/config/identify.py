@@ -61,8 +61,8 @@ class IdentifyConfig(Section):
     spread: float = internal(3.0, "expected distance of the unbounded constants from their start", gt=0)
     prune_factor: float = internal(
         4.0,
-        "families with squared residuals above this multiple of the best are dropped. If those of held-out "
-        "frames exceed those of fitted ones by it, the fit to all frames restarts",
+        "families with squared residuals above this multiple of the best with their return map are dropped. If those "
+        "of held-out frames exceed those of fitted ones by it, the fit to all frames restarts",
         gt=1,
     )
     penalty: float = Field(

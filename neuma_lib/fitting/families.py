@@ -81,7 +81,7 @@ class Family:
 
     def contains(self, other: Family) -> bool:
         """Whether the other family, with fewer constants, is a limit of this one."""
-        flows = self.spec["plasticity"]["name"] in ("von_mises", "viscous_flow")
+        flows = self.return_map in ("von_mises", "viscous_flow")
         same = self.spec["elasticity"]["name"] == other.spec["elasticity"]["name"]
         return flows and same and set(other.constants) < set(self.constants)
 
@@ -125,6 +125,11 @@ class Family:
         """Known constants of the family that lie within its bounds, and guesses for the others."""
         usable = {key: known[key] for key in self.constants if key in known and self._inside(key, known[key])}
         return {**self.guess, **usable}
+
+    @property
+    def return_map(self) -> str:
+        """Name of its plasticity."""
+        return (self.spec.get("plasticity") or {"name": "identity"})["name"]
 
     @property
     def flows(self) -> bool:

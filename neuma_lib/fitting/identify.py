@@ -4,7 +4,7 @@ Fits the constants of every candidate family and selects the family with the low
 Levenberg-Marquardt through rollout and renderer, with a Jacobian of a few rollouts. It proceeds from coarse to fine
 levels of an image pyramid, because the basin of convergence of sharp images is about a pixel. Constants are unbounded
 logarithms or logits. A family is initialised from the best of its default guess, the scene's prior and the fits of
-simpler families. Families whose loss exceeds ``prune_factor`` times the best of their kind are dropped.
+simpler families. Families whose loss exceeds ``prune_factor`` times the best with the same return map are dropped.
 
 The initial motion is estimated from the frames before contact, with an uncertainty that would bias the constants. The
 last level therefore also fits velocity and spin with a prior, and a constant shift and enlargement of the rendered
@@ -184,16 +184,17 @@ def _on_finer_grid(
     """Fits to the first frames on the finer grid, by name, which continue those on the grid of the model.
 
     They are of at most `_CONTENDERS` families whose held-out loss is at most ``prune_factor`` times the lowest, and of
-    the best family of the other kind, elastic or with plastic flow.
+    the best family with each return map whose held-out loss is at most the square of it.
 
     Images of the finer grid may differ by more than a pixel, hence the fit at the coarsest level first.
     """
     ranked = sorted((run for run in running if run.alive), key=lambda run: fits[run.family.name].score)
-    limit = fits[ranked[0].family.name].score + math.log(settings.prune_factor) if ranked else 0.0
-    close = [run for run in ranked[:_CONTENDERS] if fits[run.family.name].score <= limit]
-    others = [run for run in ranked if run.family.flows != ranked[0].family.flows]
+    lowest, factor = fits[ranked[0].family.name].score if ranked else 0.0, math.log(settings.prune_factor)
+    excess = {run: fits[run.family.name].score - lowest for run in ranked}
+    first = {run.family.return_map: run for run in reversed(ranked)}
+    close = [run for run in ranked[:_CONTENDERS] if excess[run] <= factor]
     fine = {}
-    for run in dict.fromkeys([*close, *others[:1]]):
+    for run in dict.fromkeys([*close, *(run for run in first.values() if excess[run] <= 2 * factor)]):
         again = FamilyRun(run.family, videos, [video.fitted for video in videos], settings, fine=True)
         again.begin([run.values], 0, run.deviations)
         if again.alive:
@@ -261,15 +262,15 @@ def _better_later(running: Sequence[FamilyRun]) -> list[tuple[FamilyRun, FamilyR
 
 
 def _prune(running: Sequence[FamilyRun], settings: IdentifyConfig) -> None:
-    """Drop redundant families, and those whose loss exceeds ``prune_factor`` times the best of their kind.
+    """Drop redundant families, and those whose loss exceeds ``prune_factor`` times the best with their return map.
 
-    Elastic families are one kind and those with plastic flow another one, because the error of a coarse grid, at thin
-    limbs and near the floor, is like one of them. Families that do not improve on a simpler one at a coarse level are
-    kept, since finer levels have more information.
+    Return maps are not compared, because the error of a coarse grid, at thin limbs and near the floor, is like plastic
+    flow. Families that do not improve on a simpler one at a coarse level are kept, since finer levels have more
+    information.
     """
     alive = [run for run in running if run.alive]
     for run in alive:
-        lowest = min(other.fit.cost for other in alive if other.family.flows == run.family.flows)
+        lowest = min(other.fit.cost for other in alive if other.family.return_map == run.family.return_map)
         run.alive = run.fit.cost <= settings.prune_factor * lowest
     kept = [run for run in alive if run.alive]
     for run in [run for run in kept if _is_redundant(run, kept)]:
