@@ -26,6 +26,7 @@ from neuma_lib.sim.graphs import MAX_GRAPHS, GraphCache
 from neuma_lib.sim.kernels import NO_FAULT, deformation_kernels, forward_kernels, warp_types
 from neuma_lib.sim.model import MPM, WALLS
 from neuma_lib.sim.native import NativeTransfers
+from neuma_lib.threads import thread_count
 
 SORT_EVERY = 16
 """Steps between sorts of the particles by cell, for scatter methods that need it."""
@@ -436,7 +437,9 @@ class Workspace:
             )
 
 
-_POOL_SIZE = 2  # one for the autograd graph of the last iteration, one for the next
+_POOL_SIZE = (
+    2  # one for the autograd graph of the last iteration, one for the next; and one for each further thread
+)
 _pool: list[Workspace] = []  # unused workspaces, the last used at the end
 _pool_lock = threading.RLock()  # a user can be freed in any thread
 
@@ -462,7 +465,7 @@ def free_pool() -> None:
 def _give_back(workspace: Workspace) -> None:
     with _pool_lock:
         _pool.append(workspace)
-        del _pool[:-_POOL_SIZE]
+        del _pool[: 1 - _POOL_SIZE - thread_count()]
 
 
 def _run(launch: wp.Launch, *indices: int) -> None:

@@ -95,7 +95,7 @@ def test_copies_equal_single_rollouts(name):
     slow = State(start.x, 0.5 * start.v, start.mass, start.vol0)
     names, starts = ("neo_hookean", "fluid", "neural"), (start, lifted, slow)
     laws = [make_law(name) for name in names]
-    together = rollout_batch(model, laws, starts, total=True, **RUN)
+    together = rollout_batch(model, laws, starts, total=True, together=len(laws), **RUN)
     for law, own, path in zip(laws, starts, together, strict=True):
         alone = rollout(model, law, own, total=True, **RUN)
         assert touches(model, path, own)

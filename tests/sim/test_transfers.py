@@ -133,7 +133,7 @@ def test_only_touched_nodes_are_not_zero():
     model = MODELS["particles"]
     workspace.free_pool()
     paths = rollout_batch(
-        model, [law, law], [start, lifted], steps=80, frames=(79, 80), skip_free_flight=False
+        model, [law, law], [start, lifted], steps=80, frames=(79, 80), skip_free_flight=False, together=2
     )
     (ws,) = workspace._pool
     nodes, expected = model.nodes, torch.zeros(2, *3 * [model.nodes], dtype=torch.bool)
