@@ -58,7 +58,7 @@ def test_segments_do_not_change_the_gradient(cache_bytes):
     assert touches(model, path, start)
     segment, segments = 8, 5
     states, step, grids = 8 * 36 * (segment + 1 + segments), 8 * 18, 8 * 12 * model.nodes**3
-    memory = len(start.x) * (states + step * (segment if cache_bytes else 1)) + grids
+    memory = len(start.x) * (states + step * (segment if cache_bytes else 1) + 8 * 9) + grids
     path, actual = gradients(model, law, start, memory=memory, **options)
     workspace = path.x.grad_fn.simulation.workspace
     assert workspace.size.n_checkpoints == segments

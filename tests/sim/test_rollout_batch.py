@@ -277,9 +277,7 @@ def test_number_of_threads_changes_no_bit(model, threads):
     assert expected[3] is None
     for count in (1, 2, 3):
         threads(count)
-        for one, other in zip(
-            rollout_batch(model, laws, falling(), **RUN, total=True), expected, strict=True
-        ):
+        for one, other in zip(rollout_batch(model, laws, falling(), **run), expected, strict=True):
             assert (one is None) == (other is None)
             if one is not None:
                 assert_same(one, other)

@@ -148,13 +148,17 @@ def test_only_touched_nodes_are_not_zero():
 @pytest.mark.parametrize("contact", ["obstacles", "clamps"])
 @pytest.mark.parametrize("name", ["neo_hookean", "von_mises"])
 def test_segments_equal_steps_of_python(contact, name, monkeypatch):
-    """The same bytes for any number of steps in a call, for several bodies and copies, and at each repetition."""
+    """The same bytes for any number of steps in a call, for several bodies and copies, and at each repetition.
+
+    Steps of Python compute stresses from F alone, so that those of flowing bodies differ in rounding.
+    """
     model, start, frames = MODELS[contact], falling(contact), (0, 3, 20)
     bodies = [MaterialRegion(make_law(name), 0, 37), MaterialRegion(make_law("hencky"), 37, 100)]
     tracers = start.x[:5] + 0.01
     options = [
         dict(tracers=tracers, cache_bytes=cache_bytes, **memory)
-        for cache_bytes, memory in ((math.inf, {}), (0, {}), (0, {"memory": 1.2e6}))
+        for cache_bytes in (math.inf, 0)
+        for memory in ({}, {"memory": 1.2e6})
     ]
     expected = [run(model, bodies, start, frames, **own) for own in options]
     for other in expected[1:]:
@@ -164,8 +168,11 @@ def test_segments_equal_steps_of_python(contact, name, monkeypatch):
     monkeypatch.setattr(Simulation, "_make_loop", lambda *_: None)
     monkeypatch.setattr(Simulation, "_loop", None, raising=False)
     steps = run(model, bodies, start, frames, **options[0])
-    for other in (chunks, steps):
-        assert_equal([*other[0], *other[1]], [*expected[0][0], *expected[0][1]])
+    assert_equal([*chunks[0], *chunks[1]], [*expected[0][0], *expected[0][1]])
+    if name == "neo_hookean":
+        assert_equal([*steps[0], *steps[1]], [*expected[0][0], *expected[0][1]])
+    assert_near(steps[0], expected[0][0], 1e-13)
+    assert_near(steps[1], expected[0][1], 1e-11)
 
 
 def test_gradients_of_constants(monkeypatch):
