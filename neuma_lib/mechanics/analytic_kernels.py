@@ -184,6 +184,14 @@ def flow_vjp_kernel(dtype: torch.dtype):
     return analytic_flow_vjp
 
 
+def kernel_of(
+    kind: Kind, F: Tensor, rows: Tensor, backward: bool
+) -> tuple[wp.Kernel, dict[str, Tensor | int]]:
+    """Kernel and arguments of `Constitutive.kernel`."""
+    kernel = vjp_kernel(kind, F.dtype) if backward else evaluate_kernel(kind, F.dtype)
+    return kernel, {"rows": rows, "copies": len(rows), "n": len(F) // len(rows)}
+
+
 def partial_shape(copies: int, n: int, F: Tensor) -> tuple[int, int, int]:
     """Shape (copies, packs, COEFFICIENTS) of the partials of a vjp for n rows like F of all copies."""
     return copies, pack_count(n // copies, F.device, CPU_WIDTH[F.dtype]), COEFFICIENTS

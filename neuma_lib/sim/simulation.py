@@ -108,7 +108,7 @@ class Simulation:
         self._weight_slices = weight_slices
         laws = [getattr(region.law, part) for region in regions for part in PARTS]
         self._uses_graphs = x.device.type == "cuda" and all(law.capturable for law in laws)
-        self._loops = self.workspace.native and all(law.native_rows for law in laws)
+        self._loops = self.workspace.native and all(law.loops for law in laws)
         self._loop: SegmentLoop | None = None
         self.errors: list[NonFiniteError | None] = [None] * copies
         self._graph_key = tuple((b.start, b.stop) for b in regions), tuple(law.graph_key() for law in laws)
@@ -318,11 +318,10 @@ class Simulation:
                     self.step_adjoint(before, weights, sums)
                 n = before
             if self._loop and index == 0:
-                self._loop.end_reverse()
+                self._loop.end()
             for part in PARTS:
-                for k, (_, _, own, _) in enumerate(self._laws(part, 0) if self._loop else ()):
-                    if weights[own]:
-                        sums[part][k][0][:, 1:] += self._loop.grad_rows(part, k)
+                if self._loop and index == 0:
+                    self._loop.end_reverse(part, sums[part])
                 for (law, _, own, _), received in zip(self._laws(part, 0), sums[part], strict=True):
                     law.add_up(received, tuple(weights[own]), tuple(grad_weights[own]))
 

@@ -13,6 +13,7 @@ import torch
 
 from neuma_lib.errors import NonFiniteError
 from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.mechanics.structured import structured_law
 from neuma_lib.sim import segment_loop, workspace
 from neuma_lib.sim.batch import rollout_batch
 from neuma_lib.sim.clamps import Clamp
@@ -22,6 +23,7 @@ from neuma_lib.sim.simulation import Simulation
 from neuma_lib.sim.state import State
 from tests.support.contact_scenes import COLLIDERS
 from tests.support.sim_scenes import DT, SPECS, cube, make_law, strained
+from tests.support.structured_laws import specification
 
 pytestmark = pytest.mark.core
 
@@ -173,6 +175,35 @@ def test_segments_equal_steps_of_python(contact, name, monkeypatch):
         assert_equal([*steps[0], *steps[1]], [*expected[0][0], *expected[0][1]])
     assert_near(steps[0], expected[0][0], 1e-13)
     assert_near(steps[1], expected[0][1], 1e-11)
+
+
+@pytest.mark.parametrize("plastic", [None, "von_mises"])
+def test_segments_of_structured_laws_equal_steps_of_python(plastic, monkeypatch):
+    """The same bytes of states and gradients, also of the weights, next to an analytic body and for any segments."""
+    law = structured_law(specification(plastic=plastic), dt=DT).double()
+    law.attach_adaptor(rank=None)
+    generator = torch.Generator().manual_seed(4)
+    parameters = list(law.parameters())
+    for parameter in parameters:
+        parameter.data += 0.1 * torch.randn(parameter.shape, generator=generator, dtype=torch.float64)
+    parameters = [parameter for parameter in parameters if parameter.requires_grad]
+    start, frames = falling("particles"), (0, 3, 20)
+    bodies = [MaterialRegion(law, 0, 37), MaterialRegion(make_law("von_mises"), 37, 100)]
+
+    def grads(**options):
+        path = rollout(MODELS["particles"], bodies, start, steps=20, frames=frames, **options)
+        return [path.x, path.F, *torch.autograd.grad((path.x**2).sum() + path.v.sum(), parameters)]
+
+    options = [{}, {"cache_bytes": 0}, {"memory": 1.2e6}, {"memory": 1.2e6, "cache_bytes": 0}]
+    expected = grads()
+    assert len(expected) == 2 + (3 if plastic is None else 6) and all(each.any() for each in expected)
+    for own in options:
+        assert_equal(grads(**own), expected)
+    monkeypatch.setattr(segment_loop, "PARTICLE_STEPS", 3 * len(start.x))
+    assert_equal(grads(), expected)
+    monkeypatch.setattr(Simulation, "_make_loop", lambda *_: None)
+    monkeypatch.setattr(Simulation, "_loop", None, raising=False)
+    assert_equal(grads(), expected)
 
 
 def test_gradients_of_constants(monkeypatch):
