@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -27,6 +27,7 @@ from neuma_lib.sim.batch import rollout_batch
 from neuma_lib.sim.model import MPM
 from neuma_lib.sim.state import Trajectory
 from neuma_lib.splatting.observation import Observation, joint_frames, rendered_steps, several
+from neuma_lib.threads import in_threads
 
 MOTION = 6
 """Number of unknowns of an initial motion: velocity and spin."""
@@ -57,6 +58,7 @@ class _Discretisation:
     model: MPM
     body: Reconstruction
     films: list[Filmed]
+    kernels: object = field(default_factory=object)  # key of `in_threads`
 
 
 class VideoResiduals:
@@ -160,8 +162,7 @@ class VideoResiduals:
             fine: simulate the refined body on the finer grid.
         """
         on = self._fine if fine else self._coarse
-        pairs = zip(candidates, self._paths(candidates, count, on), strict=True)
-        return [self._residual(one, path, on.films, count) for one, path in pairs]
+        return self._residuals(candidates, self._paths(candidates, count, on), on, count)
 
     def differentiate(self, at: Candidate) -> None:
         """Compute the derivatives by the deviations as forward differences, 0 where a rollout diverges."""
@@ -171,10 +172,7 @@ class VideoResiduals:
         paths = self._paths(simulated, count, self._coarse)
         # Shift and enlargement of the rendered body need no rollout.
         paths += [paths[0]] * (1 + len(varied) - len(simulated))
-        base, *others = (
-            self._residual(one, path, self._coarse.films, count)
-            for one, path in zip([at, *varied], paths, strict=True)
-        )
+        base, *others = self._residuals([at, *varied], paths, self._coarse, count)
         if base is not None:  # otherwise it diverges after the fitted frames
             self.by_deviation = [
                 [torch.zeros_like(r) for r in base] if each is None else _differences(each, base)
@@ -196,6 +194,21 @@ class VideoResiduals:
         options = dict(steps=substeps * frames[-1], frames=[substeps * n for n in frames], total=self._total)
         paths = rollout_batch(models, laws, starts, **options)
         return [path and replace(path, frames=tuple(frames)) for path in paths]
+
+    def _residuals(
+        self,
+        candidates: Sequence[Candidate],
+        paths: Sequence[Trajectory | None],
+        on: _Discretisation,
+        count: int,
+    ) -> list[list[Tensor] | None]:
+        """Residuals of the candidates, on a CPU in threads, with the same results for any number."""
+
+        def residual(pair: tuple[Candidate, Trajectory | None]) -> list[Tensor] | None:
+            return self._residual(*pair, on.films, count)
+
+        threads = None if on.body.x0.device.type == "cpu" else 1
+        return in_threads(residual, list(zip(candidates, paths, strict=True)), on.kernels, threads)
 
     @torch.no_grad()
     def _residual(

@@ -581,6 +581,14 @@
         for (int l = 0; l < used; ++l)
             for (int k = 0; k < 9; ++k) p[9 * l + k] = LANE(x[k], l);
     };
+    auto add_up = [&](uint64_t partials, size_t pack, int used, const Pack* grad_c) {
+        if (!partials) return;
+        for (int k = 0; k < COEFFICIENTS; ++k) {
+            double sum = 0;
+            for (int l = 0; l < used; ++l) sum += LANE(grad_c[k], l);
+            ((double*)partials)[COEFFICIENTS * pack + k] = sum;
+        }
+    };
 #if defined(__CUDA_ARCH__)
     const size_t pack = blockIdx.x * (size_t)THREADS + threadIdx.x;
     if (pack >= copies * (size_t)n) return;
@@ -608,10 +616,25 @@
         load(grad_out, first, used, g);
         VJP(c, x, g, value, grad_c, kept);
         store(grad_F, first, used, value);
-        if (partials)
-            for (int k = 0; k < COEFFICIENTS; ++k) {
-                double sum = 0;
-                for (int l = 0; l < used; ++l) sum += LANE(grad_c[k], l);
-                ((double*)partials)[COEFFICIENTS * pack + k] = sum;
-            }
+        add_up(partials, pack, used, grad_c);
+    }
+
+// `rows` are those of the plasticity and F is F_trial.
+//// evaluate_flow
+        Pack tau[9];
+        flow(c, (const Real*)elastic_rows + (COEFFICIENTS + 1) * copy, x, value, tau, kept);
+        store(out, first, used, value);
+        store(stress_out, first, used, tau);
+    }
+
+//// vjp_flow
+        Pack g[9], g_tau[9], returned[9], grad_c[COEFFICIENTS], grad_ce[COEFFICIENTS];
+        load(returned_F, first, used, returned);
+        load(grad_out, first, used, g);
+        load(grad_stress, first, used, g_tau);
+        const Real* const ce = (const Real*)elastic_rows + (COEFFICIENTS + 1) * copy;
+        flow_vjp(c, ce, x, returned, g, g_tau, value, grad_c, grad_ce, kept);
+        store(grad_F, first, used, value);
+        add_up(partials, pack, used, grad_c);
+        add_up(elastic_partials, pack, used, grad_ce);
     }

@@ -86,10 +86,10 @@ def laws(dtype: torch.dtype, width: int | None = None) -> str:
     return filled(text.replace("{SVD}", SVD), dtype, width or CPU_WIDTH[dtype])
 
 
-def source(kind: Kind, backward: bool, dtype: torch.dtype) -> str:
+def source(kind: Kind | Literal["flow"], backward: bool, dtype: torch.dtype) -> str:
     """C++ source of the body of a kernel."""
-    parts = native_source(__file__, ".h")
-    text = parts["rows"] + parts["vjp" if backward else "evaluate"] + END
+    parts, suffix = native_source(__file__, ".h"), "_flow" if kind == "flow" else ""
+    text = parts["rows"] + parts[("vjp" if backward else "evaluate") + suffix] + END
     text = f"    const int THREADS = {THREADS};\n" + text
     forward, vjp = ("stress", "stress_vjp") if kind == "elasticity" else ("return_map", "return_vjp")
     return laws(dtype) + text.replace("FORWARD", forward).replace("VJP", vjp)
@@ -134,6 +134,62 @@ def vjp_kernel(kind: Kind, dtype: torch.dtype):
         vjp_rows(F, rows, copies, n, cache, grad_out, grad_F, partials)
 
     return analytic_vjp
+
+
+@cache
+def flow_kernel(dtype: torch.dtype):
+    """Kernel (F_trial, rows, elastic_rows, copies, n, cache, F, tau) of a return map and the stress after it."""
+
+    @wp.func_native(source("flow", False, dtype))
+    def evaluate_flow(
+        F: wp.uint64, rows: wp.uint64, elastic_rows: wp.uint64, copies: int, n: int, cache: wp.uint64, out: wp.uint64,
+        stress_out: wp.uint64,
+    ): ...  # fmt: skip
+
+    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
+    def analytic_flow(
+        F: wp.uint64, rows: wp.uint64, elastic_rows: wp.uint64, copies: int, n: int, cache: wp.uint64, out: wp.uint64,
+        stress_out: wp.uint64,
+    ):  # fmt: skip
+        evaluate_flow(F, rows, elastic_rows, copies, n, cache, out, stress_out)
+
+    return analytic_flow
+
+
+@cache
+def flow_vjp_kernel(dtype: torch.dtype):
+    """Adjoint of `flow_kernel` for gradients of tau and of F, without the part of F through tau.
+
+    The partials of both laws are as those of `vjp_kernel`.
+    """
+
+    @wp.func_native(source("flow", True, dtype))
+    def vjp_flow(
+        F: wp.uint64, rows: wp.uint64, elastic_rows: wp.uint64, copies: int, n: int, cache: wp.uint64,
+        returned_F: wp.uint64, grad_out: wp.uint64, grad_stress: wp.uint64, grad_F: wp.uint64,
+        partials: wp.uint64, elastic_partials: wp.uint64,
+    ): ...  # fmt: skip
+
+    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
+    def analytic_flow_vjp(
+        F: wp.uint64, rows: wp.uint64, elastic_rows: wp.uint64, copies: int, n: int, cache: wp.uint64,
+        returned_F: wp.uint64, grad_out: wp.uint64, grad_stress: wp.uint64, grad_F: wp.uint64,
+        partials: wp.uint64, elastic_partials: wp.uint64,
+    ):  # fmt: skip
+        vjp_flow(
+            F, rows, elastic_rows, copies, n, cache, returned_F, grad_out, grad_stress, grad_F, partials,
+            elastic_partials,
+        )  # fmt: skip
+
+    return analytic_flow_vjp
+
+
+def kernel_of(
+    kind: Kind, F: Tensor, rows: Tensor, backward: bool
+) -> tuple[wp.Kernel, dict[str, Tensor | int]]:
+    """Kernel and arguments of `Constitutive.kernel`."""
+    kernel = vjp_kernel(kind, F.dtype) if backward else evaluate_kernel(kind, F.dtype)
+    return kernel, {"rows": rows, "copies": len(rows), "n": len(F) // len(rows)}
 
 
 def partial_shape(copies: int, n: int, F: Tensor) -> tuple[int, int, int]:

@@ -205,8 +205,18 @@ class Constants(nn.Module):
     def keeps_singular_values(self) -> bool:
         return self.native and type(self).__name__ not in kernels.WITHOUT_SINGULAR_VALUES
 
+    @property
+    def loops(self) -> bool:
+        return self.native
+
     def kernel_rows(self, F: Tensor, weights: tuple[Tensor, ...]) -> Tensor:
         return self._rows(F, weights)
+
+    def kernel(self, F, weights, backward):
+        return kernels.kernel_of(self.part, F, self._rows(F, weights), backward)
+
+    def cache_shape(self, F, weights):
+        return kernels.cache_shape(1, len(F), F)
 
     def _rows(self, F: Tensor, weights: tuple[Tensor, ...]) -> Tensor:
         """Rows (1, 1 + COEFFICIENTS) for F, kept while neither the weights nor the dtype and device change."""

@@ -37,6 +37,8 @@ class Constitutive(nn.Module):
     scratch memory."""
     native = False
     """Whether `evaluate` and `vjp` are kernels, with `response` as their reference, instead of torch."""
+    loops = False
+    """Whether `kernel` provides these for a loop over steps without Python."""
     native_rows = False
     """Whether the law is one of `analytic_kernels`, which `kernel_rows` describes."""
     keeps_singular_values = False
@@ -133,6 +135,15 @@ class Constitutive(nn.Module):
 
     def kernel_rows(self, F: Tensor, weights: Weights) -> Tensor:
         """Rows for the kernels of `analytic_kernels` of the dtype and device of F."""
+        raise NotImplementedError
+
+    def kernel(self, F: Tensor, weights: Weights, backward: bool) -> tuple[Any, dict[str, Any]]:
+        """The kernel of `evaluate` or `vjp` for a CPU, and its arguments by name except for F, the gradients, the cache
+        and the result, for laws with `loops`."""
+        raise NotImplementedError
+
+    def cache_shape(self, F: Tensor, weights: Weights) -> tuple[int, ...]:
+        """Shape of the cache of these kernels on a CPU."""
         raise NotImplementedError
 
     def accumulators(self, F: Tensor, grad_weights: Weights) -> Weights:

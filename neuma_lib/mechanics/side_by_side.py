@@ -27,6 +27,7 @@ class SideBySide(Constitutive):
 
     capturable = True
     native = True
+    loops = True
     native_rows = True
 
     def __init__(self, parts: Sequence[Constants], device: torch.device | str = "cpu"):
@@ -56,6 +57,12 @@ class SideBySide(Constitutive):
 
     def kernel_rows(self, F: Tensor, weights: Weights) -> Tensor:
         return weights[0]
+
+    def kernel(self, F, weights, backward):
+        return kernels.kernel_of(self.part, F, weights[0], backward)
+
+    def cache_shape(self, F, weights):
+        return kernels.cache_shape(len(weights[0]), len(F), F)
 
     def evaluate(self, F: Tensor, weights: Weights, out: Tensor | None = None) -> Tensor:
         return kernels.evaluate(self.part, F, weights[0], out)

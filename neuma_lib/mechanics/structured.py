@@ -200,25 +200,33 @@ class StructuredConstitutive(AdaptableConstitutive):
     isotropic = True
     capturable = True
     native = True
-    kernel: tuple[str, kernels.Constants]
+    loops = True
+    keeps_singular_values = True
+    network_kernel: tuple[str, kernels.Constants]
     """Kind of the kernel, and the constants of the law."""
 
     def graph_key(self) -> Hashable:
-        return type(self), self.kernel
+        return type(self), self.network_kernel
 
     def outputs(self, z: Tensor, weights: Weights) -> Tensor:
         """Outputs of the network (N, k) for invariants z (N, 3)."""
         return network(z, weights)
 
+    def kernel(self, F, weights, backward):
+        return kernels.kernel_of(*self.network_kernel, F, weights, backward)
+
+    def cache_shape(self, F, weights):
+        return kernels.cache_shape(F)
+
     def evaluate(self, F: Tensor, weights: Weights, out: Tensor | None = None) -> Tensor:
-        return kernels.evaluate(*self.kernel, F, weights, out)
+        return kernels.evaluate(*self.network_kernel, F, weights, out)
 
     def evaluate_with_cache(self, F, weights, out=None, cache=None):
         cache = kernels.new_cache(F) if cache is None else cache
-        return kernels.evaluate(*self.kernel, F, weights, out, cache), cache
+        return kernels.evaluate(*self.network_kernel, F, weights, out, cache), cache
 
     def vjp(self, F, weights, grad_out, cache=None, grad_F=None, grad_weights=None):
-        return kernels.vjp(*self.kernel, F, weights, grad_out, cache, grad_F, grad_weights)
+        return kernels.vjp(*self.network_kernel, F, weights, grad_out, cache, grad_F, grad_weights)
 
 
 class StructuredElasticity(StructuredConstitutive, Elasticity):
@@ -247,7 +255,7 @@ class StructuredElasticity(StructuredConstitutive, Elasticity):
         if form == "energy" and self.lam < 0 and type(base) is not Hencky:
             raise InputError("elasticity.nu", f"{base.values['nu']:g} must be >= 0 for the form 'energy'")
         base_index = kernels.BASES.index(name_of(base))
-        self.kernel = form, kernels.Constants(base_index, (self.mu, self.lam, 0.0, 0.0))
+        self.network_kernel = form, kernels.Constants(base_index, (self.mu, self.lam, 0.0, 0.0))
         self.freeze(_checked("elasticity", weights, FORMS[form], seed))
 
     def response(self, F: Tensor, weights: Weights) -> Tensor:
@@ -361,7 +369,7 @@ class StructuredPlasticity(StructuredConstitutive, Plasticity):
         viscous = isinstance(base, ViscousFlow)
         self.rate = base.values["viscosity"] / (mu * base.values["dt"]) if viscous else 0.0
         constants = self.threshold, self.friction, self.rate, self.associated
-        self.kernel = "return", kernels.Constants(int(self.granular), tuple(map(float, constants)))
+        self.network_kernel = "return", kernels.Constants(int(self.granular), tuple(map(float, constants)))
         self.freeze(_checked("plasticity", weights, PLASTIC_OUTPUTS, seed))
 
     def response(self, F: Tensor, weights: Weights) -> Tensor:

@@ -9,10 +9,24 @@
 #else
     #define READ_AGAIN
 #endif
+    const Real BEND_MAX = sizeof(Real) == 4 ? Real(1e37) : Real(1e300);
+#if defined(__CUDA_ARCH__)
+    auto reciprocal_root = [](const Pack& x) { return Real(1) / SQRT(x); };
+#else
+    // By Newton's method, in a third of the time of a root and a quotient. The first value has an error of 3.5 %.
+    auto reciprocal_root = [&](const Pack& x) {
+        const int STEPS = sizeof(Real) == 4 ? 3 : 4;
+        const Bits MAGIC = (Bits)(zero + (sizeof(Real) == 4 ? Real(1.3211836172961055e19) : Real(9.603007803048109e153)));
+        Pack r = (Pack)(MAGIC - ((Bits)x >> 1));
+        for (int i = 0; i < STEPS; ++i) r = r * (Real(1.5) - Real(0.5) * x * r * r);
+        return r;
+    };
+#endif
     // activation x / sqrt(1 + x^2), with r = 1 / sqrt(1 + x^2) and slope r^3
-    auto bend = [](auto& x, auto& r) {
+    auto bend = [&](auto& x, auto& r) {
         UNROLL for (int k = 0; k < (int)(sizeof(x) / sizeof(x[0])); ++k) {
-            r[k] = Real(1) / SQRT(x[k] * x[k] + Real(1));
+            const Pack square = x[k] * x[k] + Real(1);
+            r[k] = reciprocal_root(square > BEND_MAX ? zero + BEND_MAX : square);
             x[k] = x[k] * r[k];
         }
     };
@@ -69,14 +83,17 @@
 // u[k], v[k] and s[k], from the cache if it has them.
 //// decompose
         Pack u[3][3], v[3][3], s[3];
-        Pack* const kept = (Pack*)cache + CACHED * (first / WIDTH);
+        auto kept = [&](int k) -> Pack& {
+            const int place = first / CACHED_WIDTH;
+            return *(Pack*)((Real*)cache + (CACHED * place + k) * (size_t)CACHED_WIDTH + first % CACHED_WIDTH);
+        };
         if (cached == 2) {
             for (int k = 0; k < 3; ++k) {
                 for (int i = 0; i < 3; ++i) {
-                    u[k][i] = kept[3 * k + i];
-                    v[k][i] = kept[9 + 3 * k + i];
+                    u[k][i] = kept(3 * k + i);
+                    v[k][i] = kept(9 + 3 * k + i);
                 }
-                s[k] = kept[18 + k];
+                s[k] = kept(18 + k);
             }
         } else {
             Pack* const singular = s;
@@ -99,10 +116,10 @@
         if (cached == 1)
             for (int k = 0; k < 3; ++k) {
                 for (int i = 0; i < 3; ++i) {
-                    kept[3 * k + i] = u[k][i];
-                    kept[9 + 3 * k + i] = v[k][i];
+                    kept(3 * k + i) = u[k][i];
+                    kept(9 + 3 * k + i) = v[k][i];
                 }
-                kept[18 + k] = s[k];
+                kept(18 + k) = s[k];
             }
 
 // Logarithmic strains e of c = max(s, STRETCH_MIN), rate = d e / d s, invariants z and network.

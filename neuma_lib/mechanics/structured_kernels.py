@@ -1,6 +1,6 @@
 """Kernels of `structured`, one forward and one backward for CPU and CUDA: SVD, invariants, network, principal values.
 
-``structured_kernels.h`` processes packs: 8 rows, one per SIMD lane, on a CPU, and one row per thread on a GPU. A row
+``structured_kernels.h`` processes packs of rows, one per SIMD lane, on a CPU, and one row per thread on a GPU. A row
 stays in registers from F to the result. The backward kernel recomputes everything except the SVD, which a CPU caches,
 and uses closed-form adjoints. Gradients of the weights are summed per pack on a CPU and per block on a GPU, where a
 second kernel adds them in a fixed order.
@@ -51,6 +51,9 @@ BASES = ("hencky", "neo_hookean", "fixed_corotated")
 """Bases of elasticity in the order of their indices in the kernels."""
 CACHED = 21
 """Numbers per row that a CPU caches: U, V and the singular values."""
+EVALUATE_WIDTH = {torch.float32: 32, torch.float64: 16}
+"""Rows in a pack of the forward kernel on a CPU: two registers hide the latency of roots and quotients. The sums of the
+backward kernel would not fit into the first cache."""
 THREADS = {torch.float32: 128, torch.float64: 64}
 """Rows, and threads, per block. They use at most 40 KB of the 48 KB of shared memory that every GPU has."""
 LANES, GROUPS = 32, 8  # of the kernel that adds the sums of blocks
@@ -78,6 +81,7 @@ def _constants(kind: str, dtype: torch.dtype) -> str:
         "W2_START": first + WIDTH * (WIDTH + 1),
         "WEIGHTS": weight_count(kind),
         "CACHED": CACHED,
+        "CACHED_WIDTH": EVALUATE_WIDTH[dtype],
         "THREADS": THREADS[dtype],
         **{name.upper(): number for number, name in enumerate(BASES)},
         "GRANULAR": 1,
@@ -125,7 +129,7 @@ def source(kind: str, backward: bool, dtype: torch.dtype) -> str:
         "{CHOOSE}": "g[k] = changed ? value : g[k];" if kind == "return" else "g[k] = value;",
     }.items():
         text = text.replace(name, inserted)
-    return filled(text, dtype)
+    return filled(text, dtype, CPU_WIDTH[dtype] if backward else EVALUATE_WIDTH[dtype])
 
 
 def add_source(kind: str, dtype: torch.dtype) -> str:
@@ -137,7 +141,7 @@ def add_source(kind: str, dtype: torch.dtype) -> str:
 def evaluate_kernel(kind: str, dtype: torch.dtype):
     """Kernel (F, W0, W1, W2, index of the base, four constants, n, cached, cache, out), launched by `launch_blocks`.
 
-    If ``cached`` is 1, it writes the SVD to the cache (n / CPU_WIDTH packs, CACHED, CPU_WIDTH).
+    If ``cached`` is 1, it writes the SVD to the cache (packs, CACHED, EVALUATE_WIDTH).
     """
     real, _, _ = warp_types(dtype)
 
@@ -209,11 +213,23 @@ def _blocks(F: Tensor) -> int:
     return 1 if F.device.type == "cpu" else block_count(len(F), THREADS[F.dtype], F.device)
 
 
+def kernel_of(
+    kind: str, constants: Constants, F: Tensor, weights: Weights, backward: bool
+) -> tuple[wp.Kernel, dict[str, Tensor | float]]:
+    """Kernel and arguments of `Constitutive.kernel`."""
+    values = {f"W{i}": w.detach().contiguous() for i, w in enumerate(weights)}
+    values |= {"kind": constants.kind, "n": len(F)} | {f"p{i}": p for i, p in enumerate(constants.values)}
+    return vjp_kernel(kind, F.dtype) if backward else evaluate_kernel(kind, F.dtype), values
+
+
+def cache_shape(F: Tensor) -> tuple[int, int, int]:
+    """Shape (packs, CACHED, EVALUATE_WIDTH) of memory for the SVD of F (n, 3, 3) on a CPU."""
+    return pack_count(len(F), F.device, EVALUATE_WIDTH[F.dtype]), CACHED, EVALUATE_WIDTH[F.dtype]
+
+
 def new_cache(F: Tensor) -> Tensor | None:
-    """Memory (packs, CACHED, CPU_WIDTH) for the SVD of F (n, 3, 3) on a CPU, None on a GPU."""
-    if F.device.type != "cpu":
-        return None
-    return F.new_empty(pack_count(len(F), F.device, CPU_WIDTH[F.dtype]), CACHED, CPU_WIDTH[F.dtype])
+    """Memory for the SVD of F (n, 3, 3) on a CPU, None on a GPU."""
+    return F.new_empty(cache_shape(F)) if F.device.type == "cpu" else None
 
 
 @torch.no_grad()

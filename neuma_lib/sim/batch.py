@@ -1,8 +1,9 @@
-"""Several simulations of a body with different laws or initial states in the same launches."""
+"""Several simulations of a body with different laws or initial states, in the same launches or in threads."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import chain
 
 import torch
 
@@ -12,12 +13,13 @@ from neuma_lib.mechanics.side_by_side import fusible, side_by_side
 from neuma_lib.sim.model import MPM, MaterialRegion
 from neuma_lib.sim.rollout import check_inside, checked_frames, fly_and_simulate
 from neuma_lib.sim.state import State, Trajectory
+from neuma_lib.threads import in_threads
 
-TOGETHER = {"cpu": 8, "cuda": 64}
-"""Copies that share launches: on a CPU this saves launch overhead, a GPU needs that many to be fully used."""
+TOGETHER = {"cpu": 1, "cuda": 64}
+"""Copies that share launches. A GPU needs that many to be fully used. A core is fastest with one, which stays in its
+cache."""
 
 
-@torch.no_grad()
 def rollout_batch(
     model: MPM | Sequence[MPM],
     laws: Sequence[Law],
@@ -29,10 +31,11 @@ def rollout_batch(
     skip_free_flight: bool = True,
     together: int | None = None,
 ) -> list[Trajectory | None]:
-    """`rollout` for each of several laws, equal to round-off, without gradients and in fewer launches.
+    """`rollout` for each of several laws, equal to round-off, without gradients.
 
-    Analytic laws with kernels (`analytic_kernels`) are evaluated in one launch for any kinds and constants. Other laws
-    share only the transfers.
+    On a GPU, copies share launches. Analytic laws with kernels (`analytic_kernels`) are evaluated in one launch for any
+    kinds and constants. Other laws share only the transfers. On a CPU, copies of laws with kernels run in threads
+    (`threads.in_threads`), with the same results for any number of threads.
 
     Args:
         model: as in `rollout`, one for all laws or one per law. They may differ in friction.
@@ -67,18 +70,25 @@ def rollout_batch(
         )
     for state in {id(state): state for state in starts}.values():
         check_inside(model, state.x)
-    result: list[Trajectory | None] = [None] * len(laws)
     order = sorted(range(len(laws)), key=lambda copy: not fusible(laws[copy]))
-    together = together or TOGETHER[starts[0].x.device.type]
-    for copies in (order[i : i + together] for i in range(0, len(laws), together)):
+    device, dtype = starts[0].x.device, starts[0].x.dtype
+    together = together or TOGETHER[device.type]
+    groups = [order[i : i + together] for i in range(0, len(laws), together)]
+
+    def simulated(copies: Sequence[int]) -> list[Trajectory | None]:
         own = [laws[copy] for copy in copies], [starts[copy] for copy in copies]
         frictions = [models[copy].frictions for copy in copies]
-        paths = _side_by_side(model, *own, frames, total, skip_free_flight, frictions)
-        for copy, path in zip(copies, paths, strict=True):
-            result[copy] = path
+        return _side_by_side(model, *own, frames, total, skip_free_flight, frictions)
+
+    threads = 1 if device.type == "cuda" or not all(map(fusible, laws)) else None
+    paths = in_threads(simulated, groups, (rollout_batch, model.frictionless, dtype, total), threads)
+    result: list[Trajectory | None] = [None] * len(laws)
+    for copy, path in zip(order, chain.from_iterable(paths), strict=True):
+        result[copy] = path
     return result
 
 
+@torch.no_grad()
 def _side_by_side(
     model: MPM,
     laws: Sequence[Law],

@@ -15,6 +15,7 @@ _TOTAL_FLOATS = 9  # F_total of a particle
 _CONTACT_FLOATS = 3  # tangential displacement of a particle in contact
 _STEP_FLOATS = 18  # tau, F_trial of a particle
 _NODE_FLOATS = 8  # grid, grid_v of a node
+_NEXT_FLOATS = 9  # tau after the last step of a particle, in the same case
 _REUSED_NODE_FLOATS = 12  # grid, grid_v and grad_grid of a node, if steps share them
 
 
@@ -62,7 +63,7 @@ def plan_memory(
     """
     state = itemsize * (_STATE_FLOATS + total * _TOTAL_FLOATS + contact * _CONTACT_FLOATS) * particles
     step = itemsize * (_STEP_FLOATS * particles + keeps_grids * _NODE_FLOATS * nodes)
-    shared = 0 if keeps_grids else itemsize * _REUSED_NODE_FLOATS * nodes
+    shared = 0 if keeps_grids else itemsize * (_REUSED_NODE_FLOATS * nodes + _NEXT_FLOATS * particles)
     whole = state * (steps + 1) + step + shared
     if memory is None or whole <= memory:
         if memory is not None:

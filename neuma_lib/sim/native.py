@@ -81,6 +81,8 @@ class NativeTransfers:
             "now": Index(modulus=size.n_states),
             "after": Index(1, size.n_states),
             "cached": Index(modulus=size.n_cached_steps),
+            "stressed": Index(modulus=size.n_stresses),
+            "stressed after": Index(1, size.n_stresses),
             "pose": Index(modulus=size.n_poses),
             "step": Index(),
         }[name]
@@ -111,7 +113,7 @@ class NativeTransfers:
         """A launch whose arguments after the constants are indices or buffers by name, or those of ``others``."""
         indices, arguments = {}, []
         for position, label in enumerate(arg.label for arg in kernel.adj.args):
-            if label in ("now", "after", "cached", "pose", "step"):
+            if label in ("now", "after", "cached", "stressed", "pose", "step"):
                 indices[position] = self.index(others.get(label, label))
                 arguments.append(0)
             elif position:

@@ -1,4 +1,4 @@
-"""The steps of a segment in one call on a CPU, if all laws have kernels (`Constitutive.kernel_rows`).
+"""The steps of a segment in one call on a CPU, if all laws have kernels (`Constitutive.kernel`).
 
 Other laws run in Python between the transfers, step by step (`Simulation.step`).
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from functools import cache
+from typing import Any
 
 import torch
 import warp as wp
@@ -28,6 +29,10 @@ Parts = Mapping[str, Sequence[tuple[Constitutive, slice, Weights]]]
 class SegmentLoop:
     """Forward and reverse loops over the steps of a segment.
 
+    If all laws are analytic and a region has a return map, the stress of a step is computed at the end of the previous
+    one, because both need the same singular vectors. Only the first stress of a simulation is computed from F alone.
+    For the same bytes, a segment is therefore recomputed from the F_trial before its first F.
+
     Args:
         ws: the buffers.
         parts: laws with kernels.
@@ -45,150 +50,251 @@ class SegmentLoop:
         tracers: Repeated | None = None,
     ):
         self._ws, self._parts, self._caches_steps = ws, parts, caches_steps
-        self._rows = {
-            (part, k): law.kernel_rows(ws.F, weights)
-            for part, regions in parts.items()
-            for k, (law, _, weights) in enumerate(regions)
-        }
-        self._caches = self._new_caches(cache_bytes) if ws.size.differentiable else {}
+        self._regions = range(len(parts["elasticity"]))
         self._elastic = all(law.identity for law, _, _ in parts["plasticity"])
+        analytic = all(law.native_rows for regions in parts.values() for law, _, _ in regions)
+        self._flowing = analytic and not self._elastic
+        self._memory: list[Tensor] = []  # of arguments of the kernels
+        self._caches = self._new_caches(cache_bytes) if ws.size.differentiable else {}
         self._per_call = max(1, PARTICLE_STEPS // ws.size.particles)
-        after = () if tracers is None else (tracers,)
-        self._forward = LaunchSequence(
-            [
-                *self._stresses(),
-                *ws.native.to_grid,
-                *ws.native.to_particles[self._elastic],
-                *self._returns(),
-                *after,
-            ]
-        )
+        self._partials: dict[tuple[str, int], Tensor] = {}  # of analytic laws in the steps of a call
+        self._sums: dict[tuple[str, int], Weights] = {}  # gradients of rows of coefficients, or of weights
+        last = [] if tracers is None else [tracers]
+        before, flow = ([], self._flows()) if self._flowing else (self._stresses(), [])
+        after = flow if self._flowing or self._elastic else self._returns()
+        moves = ws.native.to_particles[self._elastic]
+        self._forward = LaunchSequence([*before, *ws.native.to_grid, *moves, *after, *last])
+        self._stress, self._flow = LaunchSequence(self._stresses()), LaunchSequence(flow)
         self._reverse: LaunchSequence | None = None
+
+    def start(self, steps: int | None) -> None:
+        """Set the first stress of a segment after one of some steps, or the first of the simulation."""
+        if self._flowing and steps is None:
+            self._stress.run(0)
+        elif self._flowing:
+            self._ws.tau[0].copy_(self._ws.tau[self._ws.stress_at(steps)])
+
+    def before(self, steps: int | None) -> Tensor:
+        """Value from which `restart` computes the first F of a segment: F_trial if the loop returns, else F."""
+        ws = self._ws
+        return ws.F[0] if not self._flowing or steps is None else ws.F_trial[ws.cached_at(steps - 1)]
+
+    def restart(self, before: Tensor | None) -> None:
+        """Set the first F and stress of a segment from the result of `before`, None for the first segment."""
+        ws = self._ws
+        if not self._flowing or before is None:
+            self.start(None)
+            return
+        ws.F_trial[0].copy_(before)
+        self._flow.run(ws.size.n_states * ws.size.n_stresses - 1)  # writes to the first places
 
     def advance(self, first: int, steps: int) -> None:
         """Run steps from ``first`` on."""
         for n in range(first, first + steps, self._per_call):
             self._forward.run(n, min(self._per_call, first + steps - n))
 
-    def start_reverse(self) -> None:
-        """Allocate what the reverse loop of a segment needs."""
+    def start_reverse(self, steps: int, before: Tensor | None) -> None:
+        """Prepare the reverse loop of a segment of some steps, after `restart` with the same value and `advance`."""
         if self._reverse is None:
-            self._reverse = self._reverse_sequence()
-        for total in self._grad_rows.values():
-            total.zero_()
+            self._record_reverse()
+        self._before = before
+        if self._flowing and not self._caches_steps:
+            self._again.run(steps - 1)
 
     def reverse(self, last: int, steps: int) -> None:
         """Run the adjoints of steps from ``last`` down."""
-        for n in range(last, last - steps, -self._per_call):
-            self._reverse.run(n, min(self._per_call, n - last + steps), -1)
-            for key, partials in self._partials.items():
-                self._grad_rows[key] += partials.sum(dim=(0, 2))
-                partials.zero_()
+        stop = last - steps
+        if stop < 0 and self._flowing and not self._caches_steps:
+            self._reverse_all(last, 0)
+            self._adjoint_flow.run(0)
+            self.restart(self._before)
+            self._adjoint_rest.run(0)
+            self._add_partials()
+        else:
+            self._reverse_all(last, stop)
 
-    def grad_rows(self, part: str, k: int) -> Tensor:
-        """Gradient of the constants of a region's law, summed over the steps since `start_reverse`."""
-        return self._grad_rows[part, k]
+    def end_reverse(self, part: str, sums: Sequence[Weights]) -> None:
+        """Add the gradients of a part's weights since the last call to those of all regions, in `accumulators`."""
+        for k, received in enumerate(sums):
+            for total, own in zip(received, self._sums.get((part, k), ()), strict=True):
+                total[..., -own.shape[-1] :] += own
+                own.zero_()
 
-    def _reverse_sequence(self) -> LaunchSequence:
+    def end(self) -> None:
+        """Add the part through the first stress of a simulation to the gradient of its F."""
+        if self._flowing:
+            self._adjoint_stress.run(0)
+            self._add_partials()
+
+    def _reverse_all(self, last: int, stop: int) -> None:
+        """Run the adjoints of steps from ``last`` to ``stop`` + 1."""
+        for n in range(last, stop, -self._per_call):
+            self._reverse.run(n, min(self._per_call, n - stop), -1)
+            self._add_partials()
+
+    def _add_partials(self) -> None:
+        for key, partials in self._partials.items():
+            self._sums[key][0].add_(partials.sum(dim=(0, 2)))
+            partials.zero_()
+
+    def _record_reverse(self) -> None:
+        """Record the reverse loop and allocate what it needs."""
         ws = self._ws
         steps = max(1, min(ws.size.n_states - 1, self._per_call))
-        self._partials: dict[tuple[str, int], Tensor] = {}  # of the steps of a call
-        self._grad_rows: dict[tuple[str, int], Tensor] = {}
-        adjoints: dict[str, list[Repeated]] = {}
         for part, regions in self._parts.items():
-            F, at = (ws.F, _NOW) if part == "elasticity" else (ws.F_trial, _CACHED)
-            grad_out, grad_F = (
-                (ws.grad_tau, ws.grad_F_elastic) if part == "elasticity" else (ws.grad_F, ws.grad_F_trial)
-            )
-            adjoints[part] = []
-            for k, (_, here, weights) in enumerate(regions):
-                values = dict(F=(F, at), grad_out=(grad_out, None), grad_F=(grad_F, None))
-                extra = {}
-                if weights:
-                    shape = analytic_kernels.partial_shape(
-                        len(self._rows[part, k]), here.stop - here.start, F
-                    )
+            for k, (law, here, weights) in enumerate(regions):
+                if weights and law.native_rows:
+                    rows = law.kernel_rows(ws.F, weights)
+                    shape = analytic_kernels.partial_shape(len(rows), here.stop - here.start, ws.F)
                     self._partials[part, k] = torch.zeros((steps, *shape), dtype=torch.float64)
-                    extra["partials"] = self._partials[part, k]
-                    self._grad_rows[part, k] = self._partials[part, k].sum(dim=(0, 2))
-                kernel = analytic_kernels.vjp_kernel(part, ws.size.dtype)
-                adjoints[part].append(self._launch(kernel, part, k, values, extra))
-        before = (
-            [] if self._caches_steps else [*self._stresses(), *(() if self._elastic else ws.native.to_trial)]
-        )
-        return LaunchSequence(
-            [
-                *before,
-                *ws.native.to_grid,
-                *(() if self._elastic else adjoints["plasticity"]),
-                *ws.native.adjoint[self._elastic],
-                *adjoints["elasticity"],
-                ws.native.add_elastic,
-            ]
-        )
+                    self._sums[part, k] = (self._partials[part, k].sum(dim=(0, 2)),)
+                elif weights:
+                    self._sums[part, k] = tuple(torch.zeros_like(w) for w in weights)
+        stresses = [*self._stress_adjoints(), ws.native.add_elastic]
+        transfers = [*ws.native.to_grid, *ws.native.adjoint[self._elastic]]
+        if not self._flowing:
+            again = [*self._stresses(), *(() if self._elastic else ws.native.to_trial)]
+            returns = [] if self._elastic else self._return_adjoints()
+            to_grid, adjoint = ws.native.to_grid, ws.native.adjoint[self._elastic]
+            again = [] if self._caches_steps else again
+            self._reverse = LaunchSequence([*again, *to_grid, *returns, *adjoint, *stresses])
+            return
+        flows, trial = self._flow_adjoints(), [one.earlier() for one in ws.native.to_trial]
+        again = [] if self._caches_steps else [*trial, *self._flows(earlier=True)]
+        self._reverse = LaunchSequence([*flows, *again, *transfers])
+        self._again = LaunchSequence([*ws.native.to_trial, *self._flows()])
+        self._adjoint_flow, self._adjoint_rest = LaunchSequence(flows), LaunchSequence(transfers)
+        self._adjoint_stress = LaunchSequence(stresses)
 
     def _new_caches(self, cache_bytes: float) -> dict[tuple[str, int], Tensor]:
-        """Memory for singular values by region, which later rollouts of the workspace use again."""
+        """Memory for singular values by part and region, which later rollouts of the workspace use again.
+
+        A return map and the stress after it at once use that of the return map.
+        """
         ws, caches = self._ws, {}
-        for (part, k), rows in self._rows.items():
-            law, here, _ = self._parts[part][k]
-            if not law.keeps_singular_values or part == "plasticity" and not self._caches_steps:
-                continue
-            shape = (
-                ws.size.n_cached_steps,
-                *analytic_kernels.cache_shape(len(rows), here.stop - here.start, ws.F),
-            )
-            cache_bytes -= math.prod(shape) * ws.F.element_size() if self._caches_steps else 0
-            if cache_bytes >= 0:
-                key = "segment", part, shape
-                if key not in ws.law_caches:
-                    ws.law_caches[key] = ws.F.new_empty(shape)
-                caches[part, k] = ws.law_caches[key]
+        for part, regions in self._parts.items():
+            for k, (law, here, weights) in enumerate(regions):
+                keeps = law.keeps_singular_values
+                if self._flowing:
+                    keeps = part == "plasticity" and (
+                        keeps or self._parts["elasticity"][k][0].keeps_singular_values
+                    )
+                elif part == "plasticity" and not self._caches_steps:
+                    keeps = False
+                if not keeps:
+                    continue
+                shape = (ws.size.n_cached_steps, *law.cache_shape(ws.F[0][here], weights))
+                cache_bytes -= math.prod(shape) * ws.F.element_size() if self._caches_steps else 0
+                if cache_bytes >= 0:
+                    key = "segment", part, k, shape
+                    if key not in ws.law_caches:
+                        ws.law_caches[key] = ws.F.new_empty(shape)
+                    caches[part, k] = ws.law_caches[key]
         return caches
 
     def _stresses(self) -> list[Repeated]:
-        ws = self._ws
-        kernel = analytic_kernels.evaluate_kernel("elasticity", ws.size.dtype)
-        values = dict(F=(ws.F, _NOW), out=(ws.tau, _CACHED))
-        return [self._launch(kernel, "elasticity", k, values) for k in range(len(self._parts["elasticity"]))]
+        return self._each("elasticity", False, F=(self._ws.F, "now"), out=(self._ws.tau, "stressed"))
 
     def _returns(self) -> list[Repeated]:
-        if self._elastic:
-            return []
+        return self._each("plasticity", False, F=(self._ws.F_trial, "cached"), out=(self._ws.F, "after"))
+
+    def _stress_adjoints(self) -> list[Repeated]:
         ws = self._ws
-        kernel = analytic_kernels.evaluate_kernel("plasticity", ws.size.dtype)
-        values = dict(F=(ws.F_trial, _CACHED), out=(ws.F, _AFTER))
-        return [self._launch(kernel, "plasticity", k, values) for k in range(len(self._parts["plasticity"]))]
+        grads = dict(grad_out=(ws.grad_tau, None), grad_F=(ws.grad_F_elastic, None))
+        return self._each("elasticity", True, F=(ws.F, "now"), **grads)
+
+    def _return_adjoints(self) -> list[Repeated]:
+        ws = self._ws
+        grads = dict(grad_out=(ws.grad_F, None), grad_F=(ws.grad_F_trial, None))
+        return self._each("plasticity", True, F=(ws.F_trial, "cached"), **grads)
+
+    def _each(self, part: str, backward: bool, **values: tuple[Tensor, str | None]) -> list[Repeated]:
+        """Launches of the kernels of all regions, see `_launch`."""
+        launches = []
+        for k, (law, here, weights) in enumerate(self._parts[part]):
+            kernel, given = law.kernel(self._ws.F[0][here], weights, backward)
+            by_step = {"partials": self._partials.get((part, k))} if backward else {}
+            if backward and not law.native_rows:
+                given |= {f"total{i}": own for i, own in enumerate(self._sums.get((part, k), ()))}
+            cache = self._caches.get((part, k))
+            if cache is not None and not law.native_rows:
+                given["cached"] = 2 if backward else 1
+            launches.append(self._launch(kernel, here, given, {"cache": cache, **by_step}, values))
+        return launches
+
+    def _flows(self, earlier: bool = False) -> list[Repeated]:
+        """Return map of a step and the stress of the next, or the same of the step before."""
+        ws = self._ws
+        kernel = analytic_kernels.flow_kernel(ws.size.dtype)
+        values = dict(F=(ws.F_trial, "cached"), out=(ws.F, "after"), stress_out=(ws.tau, "stressed after"))
+        launches = [
+            self._launch(
+                kernel, *self._both(k), {"cache": self._caches.get(("plasticity", k))}, values=values
+            )
+            for k in self._regions
+        ]
+        return [one.earlier() for one in launches] if earlier else launches
+
+    def _flow_adjoints(self) -> list[Repeated]:
+        ws = self._ws
+        kernel = analytic_kernels.flow_vjp_kernel(ws.size.dtype)
+        values = dict(
+            F=(ws.F_trial, "cached"),
+            returned_F=(ws.F, "after"),
+            grad_out=(ws.grad_F, None),
+            grad_stress=(ws.grad_tau, None),
+            grad_F=(ws.grad_F_trial, None),
+        )
+        launches = []
+        for k in self._regions:
+            by_step = {
+                "cache": self._caches.get(("plasticity", k)),
+                "partials": self._partials.get(("plasticity", k)),
+                "elastic_partials": self._partials.get(("elasticity", k)),
+            }
+            launches.append(self._launch(kernel, *self._both(k), by_step, values=values))
+        return launches
+
+    def _both(self, k: int) -> tuple[slice, dict[str, Any]]:
+        """Particles of a region, and arguments for both of its laws."""
+        (elastic, here, own), (plastic, _, weights) = (
+            self._parts[part][k] for part in ("elasticity", "plasticity")
+        )
+        _, given = plastic.kernel(self._ws.F[0][here], weights, False)
+        return here, {**given, "elastic_rows": elastic.kernel_rows(self._ws.F, own)}
 
     def _launch(
         self,
         kernel: wp.Kernel,
-        part: str,
-        k: int,
+        here: slice,
+        given: Mapping[str, Any],
+        by_step: Mapping[str, Tensor | None],
         values: Mapping[str, tuple[Tensor, str | None]],
-        by_step: Mapping[str, Tensor] = {},
     ) -> Repeated:
-        """A law's kernel for a region.
+        """A kernel for the particles of a region.
 
         Args:
+            given: arguments by name, tensors or numbers.
+            by_step: arguments with one item per step of the segment, if any.
             values: argument by name: values of all particles, and the index of their first axis if there is one.
-            by_step: arguments with one item per step of the segment.
         """
-        ws, rows = self._ws, self._rows[part, k]
-        _, here, _ = self._parts[part][k]
+        ws, arguments, indices = self._ws, {}, {}
         labels = {arg.label: position for position, arg in enumerate(kernel.adj.args)}
-        given = {"rows": rows.data_ptr(), "copies": len(rows), "n": (here.stop - here.start) // len(rows)}
-        indices = {}
+        for name, value in given.items():
+            if isinstance(value, Tensor):
+                self._memory.append(value)
+                value = value.data_ptr()
+            arguments[labels[name]] = value
         for name, (value, at) in values.items():
-            given[name] = (value if at is None else value[0])[here].data_ptr()
+            address = (value if at is None else value[0])[here].data_ptr()
+            arguments[labels[name]] = address
             if at is not None:
-                indices[labels[name]] = ws.native.index(at)._replace(base=given[name], stride=_stride(value))
-        if (part, k) in self._caches:
-            by_step = {**by_step, "cache": self._caches[part, k]}
+                indices[labels[name]] = ws.native.index(at)._replace(base=address, stride=_stride(value))
         for name, value in by_step.items():
-            given[name] = value.data_ptr()
-            indices[labels[name]] = Index(0, len(value), given[name], _stride(value))
-        return Repeated(_launch(kernel), indices, {labels[name]: value for name, value in given.items()})
+            if value is not None:
+                arguments[labels[name]] = value.data_ptr()
+                indices[labels[name]] = Index(0, len(value), value.data_ptr(), _stride(value))
+        return Repeated(_launch(kernel), indices, arguments)
 
 
 @cache
@@ -196,9 +302,6 @@ def _launch(kernel: wp.Kernel) -> wp.Launch:
     """A recorded launch of a law's kernel, whose arguments are numbers."""
     inputs = [0] * len(kernel.adj.args)
     return wp.launch(kernel, dim=1, inputs=inputs, device="cpu", block_dim=1, record_cmd=True)
-
-
-_NOW, _AFTER, _CACHED = "now", "after", "cached"
 
 
 def _stride(value: Tensor) -> int:

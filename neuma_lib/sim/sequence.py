@@ -44,6 +44,7 @@ class Repeated:
     """
 
     def __init__(self, launch: wp.Launch, indices: Mapping[int, Index] = {}, values: Mapping[int, int] = {}):
+        self._given = launch, indices, values
         bounds, *arguments = launch.params
         kind, offsets = _structure(tuple(map(type, arguments)))
         self.launch, self._arguments = launch, kind(*arguments)
@@ -55,6 +56,12 @@ class Repeated:
         for position, index in indices.items():
             is_address = ctypes.sizeof(arguments[position]) >= 8  # also the first member of an array
             self.program += [start + offsets[position], int(is_address), *index]
+
+    def earlier(self) -> "Repeated":
+        """The launch for the step before."""
+        launch, indices, values = self._given
+        shifted = {position: index._replace(offset=index.offset - 1) for position, index in indices.items()}
+        return Repeated(launch, shifted, values)
 
 
 class LaunchSequence:

@@ -108,7 +108,7 @@ class Simulation:
         self._weight_slices = weight_slices
         laws = [getattr(region.law, part) for region in regions for part in PARTS]
         self._uses_graphs = x.device.type == "cuda" and all(law.capturable for law in laws)
-        self._loops = self.workspace.native and all(law.native_rows for law in laws)
+        self._loops = self.workspace.native and all(law.loops for law in laws)
         self._loop: SegmentLoop | None = None
         self.errors: list[NonFiniteError | None] = [None] * copies
         self._graph_key = tuple((b.start, b.stop) for b in regions), tuple(law.graph_key() for law in laws)
@@ -137,19 +137,22 @@ class Simulation:
         self._make_loop(weights, None if passive is None else passive.repeated)
         faults = ws.faults.clone()
         self._copy_frames(0, [0], frames, result)
-        last = 0  # index of the last state of the previous segment
+        last, previous = 0, None  # index of the last state of the previous segment, and its number of steps
         for index, (first, steps) in enumerate(self._segments(frames)):
             for state in states if last else ():
                 state[0].copy_(state[last])
             for checkpoint, state in zip(ws.checkpoints, ws.states, strict=True):
                 if len(checkpoint):
-                    checkpoint[index].copy_(state[0])
+                    from_loop = self._loop and state is ws.F
+                    checkpoint[index].copy_(self._loop.before(previous) if from_loop else state[0])
+            if self._loop:
+                self._loop.start(previous)
             ws.load_poses(self.first + first, steps)
             if passive is None:
                 self._launch(("forward", steps), lambda steps=steps: self._advance(steps, weights))
             else:
                 self._advance(steps, weights, passive, first)
-            last, self._segment_in_memory = ws.at(steps), index
+            last, previous, self._segment_in_memory = ws.at(steps), steps, index
             self._copy_frames(first, range(1, steps + 1) if self.plan else [steps], frames, result)
             shifted = torch.where(ws.faults < NO_FAULT, ws.faults + (first << 31), ws.faults)
             torch.minimum(faults, shifted, out=faults)
@@ -167,7 +170,7 @@ class Simulation:
         ws = self.workspace
         cached = ws.cached_at(n)
         ws.sort(n)
-        self._evaluate("elasticity", n, ws.F[ws.at(n)], weights, ws.tau[cached])
+        self._evaluate("elasticity", n, ws.F[ws.at(n)], weights, ws.tau[ws.stress_at(n)])
         ws.transfer_to_grid(n)
         ws.transfer_to_particles(n)
         self._evaluate("plasticity", n, ws.F_trial[cached], weights, ws.F[ws.at(n + 1)])
@@ -182,13 +185,15 @@ class Simulation:
         else:
             grad_weights = [torch.zeros_like(w) for w in weights]
         totals = ws.grad_states
-        for total in (*totals, *grad_weights):
+        for total in (*totals, *grad_weights, ws.grad_tau):
             total.zero_()
         for index, (first, steps) in reversed(list(enumerate(self._segments(frames)))):
             ws.load_poses(self.first + first, steps)
             if index != self._segment_in_memory:
                 for checkpoint, state in zip(ws.checkpoints, ws.states, strict=True):
                     state[0].copy_(checkpoint[index])
+                if self._loop:
+                    self._loop.restart(self._before(index))
                 self._launch(("forward", steps), lambda steps=steps: self._advance(steps, weights))
                 self._segment_in_memory = index
             here = [f for f, n in enumerate(frames) if first < n <= first + steps]
@@ -200,8 +205,8 @@ class Simulation:
                 added = ws.load_frame_grads(name, added)
             self._launch(
                 name,
-                lambda steps=steps, at=at, added=added: self._reverse(
-                    steps, at, added, weights, grad_weights
+                lambda steps=steps, at=at, added=added, index=index: self._reverse(
+                    index, steps, at, added, weights, grad_weights
                 ),
             )
         if frames[0] == 0:
@@ -217,7 +222,7 @@ class Simulation:
         cached = ws.cached_at(n)
         F, F_trial = ws.F[ws.at(n)], ws.F_trial[cached]
         if not self.plan.caches_steps:
-            self._evaluate("elasticity", n, F, weights, ws.tau[cached], fill_cache=True)
+            self._evaluate("elasticity", n, F, weights, ws.tau[ws.stress_at(n)], fill_cache=True)
             ws.trial_deformation(n)
         if not self.plan.caches_steps or ws.native:
             ws.transfer_to_grid(n)
@@ -271,8 +276,13 @@ class Simulation:
                     passive.move(n)
                     passive.store(first + n + 1)
 
+    def _before(self, index: int) -> Tensor | None:
+        """F_trial before a segment, or None if it is the first."""
+        return self.workspace.checkpoints[2][index] if index else None
+
     def _reverse(
         self,
+        index: int,
         steps: int,
         at: Sequence[int],
         added: Sequence[Tensor | None],
@@ -294,7 +304,7 @@ class Simulation:
                 for part in PARTS
             }
             if self._loop:
-                self._loop.start_reverse()
+                self._loop.start_reverse(steps, self._before(index))
             n = steps
             while n > 0:
                 if n in frame_of:
@@ -307,10 +317,11 @@ class Simulation:
                 else:
                     self.step_adjoint(before, weights, sums)
                 n = before
+            if self._loop and index == 0:
+                self._loop.end()
             for part in PARTS:
-                for k, (_, _, own, _) in enumerate(self._laws(part, 0) if self._loop else ()):
-                    if weights[own]:
-                        sums[part][k][0][:, 1:] += self._loop.grad_rows(part, k)
+                if self._loop and index == 0:
+                    self._loop.end_reverse(part, sums[part])
                 for (law, _, own, _), received in zip(self._laws(part, 0), sums[part], strict=True):
                     law.add_up(received, tuple(weights[own]), tuple(grad_weights[own]))
 

@@ -183,7 +183,7 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
     def p2g(
         c: GridConstants,
         now: wp.int32,
-        cached: wp.int32,
+        stressed: wp.int32,
         x: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
         C: wp.array2d(dtype=mat33),
@@ -196,9 +196,9 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
     ):
         """As `kernels.p2g`, and clears all grids before."""
         if wp.static(contact):
-            p2g_loop(c, x[now], v_now, C[now], tau[cached], mass_now, vol_now, spans, grids)
+            p2g_loop(c, x[now], v_now, C[now], tau[stressed], mass_now, vol_now, spans, grids)
         else:
-            p2g_loop(c, x[now], v[now], C[now], tau[cached], mass_now, vol_now, spans, grids)
+            p2g_loop(c, x[now], v[now], C[now], tau[stressed], mass_now, vol_now, spans, grids)
 
     @kernel
     def grid_update(
@@ -341,7 +341,7 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
     def p2g_adjoint(
         c: GridConstants,
         now: wp.int32,
-        cached: wp.int32,
+        stressed: wp.int32,
         x: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
         C: wp.array2d(dtype=mat33),
@@ -362,7 +362,7 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
                 x[now],
                 v_now,
                 C[now],
-                tau[cached],
+                tau[stressed],
                 mass_now,
                 vol_now,
                 grids[2],
@@ -377,7 +377,7 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
                 x[now],
                 v[now],
                 C[now],
-                tau[cached],
+                tau[stressed],
                 mass_now,
                 vol_now,
                 grids[2],

@@ -26,6 +26,7 @@ from neuma_lib.sim.graphs import MAX_GRAPHS, GraphCache
 from neuma_lib.sim.kernels import NO_FAULT, deformation_kernels, forward_kernels, warp_types
 from neuma_lib.sim.model import MPM, WALLS
 from neuma_lib.sim.native import NativeTransfers
+from neuma_lib.threads import thread_count
 
 SORT_EVERY = 16
 """Steps between sorts of the particles by cell, for scatter methods that need it."""
@@ -55,6 +56,11 @@ class WorkspaceSize(NamedTuple):
     scatter: str = "atomic"  # scatter method
     n_poses: int = 1  # steps of a segment if colliders or clamps change
 
+    @property
+    def n_stresses(self) -> int:
+        """Number of stored stresses. On a CPU those after a step may be computed at its end."""
+        return self.n_cached_steps + (self.scatter == "native")
+
 
 class Workspace:
     """States, grids and gradients of the N particles of all copies.
@@ -68,7 +74,8 @@ class Workspace:
         F_total: total deformation gradients, shape (n_states, N, 3, 3), if the state includes them.
         stuck: tangential displacements of particles in contact [m], shape (n_states, N, 3), see `Collider`.
         states: x, v, F, C, optionally F_total, and stuck with contact of particles; grad_states: their gradients.
-        tau, F_trial: Kirchhoff stresses [Pa] and trial deformation gradients, shape (n_cached_steps, N, 3, 3).
+        tau: Kirchhoff stresses [Pa], shape (n_stresses, N, 3, 3).
+        F_trial: trial deformation gradients, shape (n_cached_steps, N, 3, 3).
         grid: momentum [kg m/s] and mass [kg] of the nodes, shape (n_cached_steps, copies * nodes^3, 4).
         grid_v: velocity [m/s] of the nodes and 1 where there is mass, shape (n_cached_steps, copies * nodes^3, 4).
         mass, vol0: particle masses [kg] and initial volumes [m^3], shape (N,).
@@ -111,7 +118,8 @@ class Workspace:
         self.stuck = self.buffer((states, N) if self._contact else (1, 1), "vec3")
         if self._contact:
             self.states += (self.stuck,)
-        self.tau, self.F_trial = self.buffer((cached, N), "mat33"), self.buffer((cached, N), "mat33")
+        self.tau = self.buffer((size.n_stresses, N), "mat33")
+        self.F_trial = self.buffer((cached, N), "mat33")
         self.mass, self.vol0, self.radius = (self.buffer((N,), "real") for _ in range(3))
         self.native = NativeTransfers(self) if size.scatter == "native" else None
         if self.native:
@@ -169,8 +177,12 @@ class Workspace:
         return step % self.size.n_states
 
     def cached_at(self, step: int) -> int:
-        """Index of the stress and grids of a step."""
+        """Index of F_trial and the grids of a step."""
         return step % self.size.n_cached_steps
+
+    def stress_at(self, step: int) -> int:
+        """Index of the stress of a step."""
+        return step % self.size.n_stresses
 
     def sorted_at(self, step: int) -> int:
         """Index of the particle order in a step."""
@@ -436,7 +448,9 @@ class Workspace:
             )
 
 
-_POOL_SIZE = 2  # one for the autograd graph of the last iteration, one for the next
+_POOL_SIZE = (
+    2  # one for the autograd graph of the last iteration, one for the next; and one for each further thread
+)
 _pool: list[Workspace] = []  # unused workspaces, the last used at the end
 _pool_lock = threading.RLock()  # a user can be freed in any thread
 
@@ -462,7 +476,7 @@ def free_pool() -> None:
 def _give_back(workspace: Workspace) -> None:
     with _pool_lock:
         _pool.append(workspace)
-        del _pool[:-_POOL_SIZE]
+        del _pool[: 1 - _POOL_SIZE - thread_count()]
 
 
 def _run(launch: wp.Launch, *indices: int) -> None:

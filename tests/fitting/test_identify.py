@@ -20,7 +20,7 @@ from neuma_lib.fitting.frame_batches import check_contact, first_contact
 from neuma_lib.fitting.identified import FamilyFit
 from neuma_lib.fitting.identify import _better_later, _prune, _select, identify
 from neuma_lib.fitting.least_squares import Linearisation, jackknife, levenberg_marquardt, secant_update
-from neuma_lib.fitting.video_residuals import VideoResiduals, averaged
+from neuma_lib.fitting.video_residuals import Candidate, VideoResiduals, averaged
 from neuma_lib.io.files import write_json
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.combinations import named_combinations
@@ -32,6 +32,7 @@ from neuma_lib.sim.model import COURANT_LIMIT
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 from neuma_lib.splatting.observation import Observation
+from neuma_lib.threads import use_threads
 from tests.support import grounding_scene
 from tests.support.errors import refused
 from tests.support.grounding_scene import MODEL, RADIUS, camera, observe
@@ -343,6 +344,28 @@ def test_a_flow_that_never_yields_shows_the_elastic_body():
         run.fit = Linearisation(np.zeros(0), np.zeros(0), run.cost(run._u), 0.0)
     elastic, never_yields, yields = runs
     assert never_yields.resembles(elastic) and not yields.resembles(elastic)
+
+
+def test_number_of_threads_changes_no_bit_of_the_residuals():
+    """And of the derivatives by the initial motion and the position of the rendered body."""
+    body, seen = video_of(ELASTIC, V0, FRAMES)
+    chosen = settings(
+        {"hencky": ELASTIC}, covariance_from="elastic", refined_particles=0, pose_tolerance=0.01
+    )
+    candidates = [Candidate(law("hencky", E=E), np.zeros(9)) for E in (3e4, 1e5, 3e5)]
+    results = []
+    for count in (1, 2, 3):
+        use_threads(count)
+        try:
+            video = VideoResiduals(MODEL, known(body, (0.1,) * 6), body, seen, chosen)
+            video.differentiate(candidates[0])
+            values = [*video.residuals(candidates, len(FRAMES)), *video.by_deviation]
+        finally:
+            use_threads(1)
+        results.append([residual for each in values for residual in each])
+    assert len(results[0]) == len(candidates) + 9 and results[0][-1].abs().max() > 0
+    for other in results[1:]:
+        assert all(map(torch.equal, results[0], other))
 
 
 def test_frames_after_the_contact_decide():

@@ -147,7 +147,7 @@ def test_copies_of_a_batch_have_their_own_clamped_particles():
     model, start = clamped_cube("released")
     starts = [start, replace(start, x=start.x.roll(7, 0) + torch.tensor([0.01, 0.02, 0.0]).double())]
     laws = [make_law("neo_hookean"), make_law("hencky")]
-    together = rollout_batch(model, laws, starts, steps=30, frames=(10, 30))
+    together = rollout_batch(model, laws, starts, steps=30, frames=(10, 30), together=len(laws))
     assert not torch.equal(*(clamped_particles(model.clamps, own.x) for own in starts))
     for law, own, path in zip(laws, starts, together, strict=True):
         alone = rollout(model, law, own, steps=30, frames=(10, 30))

@@ -58,7 +58,7 @@ def test_segments_do_not_change_the_gradient(cache_bytes):
     assert touches(model, path, start)
     segment, segments = 8, 5
     states, step, grids = 8 * 36 * (segment + 1 + segments), 8 * 18, 8 * 12 * model.nodes**3
-    memory = len(start.x) * (states + step * (segment if cache_bytes else 1)) + grids
+    memory = len(start.x) * (states + step * (segment if cache_bytes else 1) + 8 * 9) + grids
     path, actual = gradients(model, law, start, memory=memory, **options)
     workspace = path.x.grad_fn.simulation.workspace
     assert workspace.size.n_checkpoints == segments
@@ -95,7 +95,7 @@ def test_copies_equal_single_rollouts(name):
     slow = State(start.x, 0.5 * start.v, start.mass, start.vol0)
     names, starts = ("neo_hookean", "fluid", "neural"), (start, lifted, slow)
     laws = [make_law(name) for name in names]
-    together = rollout_batch(model, laws, starts, total=True, **RUN)
+    together = rollout_batch(model, laws, starts, total=True, together=len(laws), **RUN)
     for law, own, path in zip(laws, starts, together, strict=True):
         alone = rollout(model, law, own, total=True, **RUN)
         assert touches(model, path, own)

@@ -1,6 +1,7 @@
 """Several rollouts in the same launches: equality with single rollouts, divergence of one, laws without kernels."""
 
 import math
+import threading
 from dataclasses import replace
 
 import pytest
@@ -12,6 +13,7 @@ from neuma_lib.mechanics.analytic_kernels import COEFFICIENTS
 from neuma_lib.mechanics.elasticity import Hencky
 from neuma_lib.mechanics.law import Law
 from neuma_lib.mechanics.side_by_side import fusible, side_by_side
+from neuma_lib.sim import batch
 from neuma_lib.sim.batch import rollout_batch
 from neuma_lib.sim.colliders import Collider
 from neuma_lib.sim.memory import MemoryPlan
@@ -19,6 +21,7 @@ from neuma_lib.sim.model import MPM, MaterialRegion
 from neuma_lib.sim.rollout import RolloutFunction, rollout
 from neuma_lib.sim.simulation import Simulation, gather_weights
 from neuma_lib.sim.state import State
+from neuma_lib.threads import use_threads
 from tests.support.errors import refused
 from tests.support.sim_scenes import DT, SPECS, cube, make_law, moving_cube, strained
 
@@ -42,6 +45,11 @@ FURTHER = {
 }
 FUSED = {**SPECS, **FURTHER}
 UNSTABLE = {"elasticity": {"name": "hencky", "E": 5e8, "nu": 0.3}}
+
+
+@pytest.fixture(autouse=True)
+def copies_share_launches(monkeypatch):
+    monkeypatch.setitem(batch.TOGETHER, "cpu", 8)
 
 
 def law(name, stiffness=1.0):
@@ -250,3 +258,42 @@ def test_the_gpu_agrees_also_when_it_replays(dtype, contact):
             assert (actual is None) == (expected is None)
             if actual:
                 assert_same(actual.cpu(), expected, 1e4 * torch.finfo(dtype).eps)
+
+
+@pytest.fixture
+def threads():
+    """`use_threads`, undone after the test."""
+    yield use_threads
+    use_threads(1)
+
+
+@pytest.mark.parametrize("model", [MODEL, SLIDING])
+def test_number_of_threads_changes_no_bit(model, threads):
+    """Also of new kinds of laws and starts, and where one diverges."""
+    laws = [law(name, stiffness) for name in FUSED for stiffness in (1.0, 1.3)]
+    laws.insert(3, analytic_law(UNSTABLE))
+    run = dict(**RUN, total=True, together=1)
+    expected = [rollout_batch(model, [own], falling(), **run)[0] for own in laws]
+    assert expected[3] is None
+    for count in (1, 2, 3):
+        threads(count)
+        for one, other in zip(rollout_batch(model, laws, falling(), **run), expected, strict=True):
+            assert (one is None) == (other is None)
+            if one is not None:
+                assert_same(one, other)
+                assert torch.equal(one.F_total, other.F_total)
+
+
+def test_copies_run_at_the_same_time(threads, monkeypatch):
+    """Each of two threads waits within its rollout until the other has begun one."""
+    both, simulate = threading.Barrier(2, timeout=20), batch.fly_and_simulate
+    laws = [law("hencky"), law("von_mises")]
+    rollout_batch(MODEL, laws, falling(), **RUN, together=1)  # loads the kernels
+
+    def waiting(*args, **options):
+        both.wait()
+        return simulate(*args, **options)
+
+    monkeypatch.setattr(batch, "fly_and_simulate", waiting)
+    threads(2)
+    assert None not in rollout_batch(MODEL, laws, falling(), **RUN, together=1)

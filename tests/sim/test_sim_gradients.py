@@ -264,7 +264,7 @@ def test_checkpoints_do_not_change_the_gradient(cache_bytes, segment, total):
     _, expected = gradients(model, law, start, frames, parameters, **options)
     state, step, grids = 8 * (36 if total else 27) * N, 8 * 18 * N, 8 * 12 * model.nodes**3
     states = state * (segment + 1 + math.ceil(steps / segment))
-    options["memory"] = states + step * (segment if cache_bytes else 1) + grids
+    options["memory"] = states + step * (segment if cache_bytes else 1) + grids + 8 * 9 * N
     plan = plan_memory(steps, N, model.nodes**3, 8, **options, contact=True, keeps_grids=False)
     assert plan == MemoryPlan(segment, cache_bytes > 0, 0)
     loss = random_loss(simulate(model, law, start, frames, **options))

@@ -242,7 +242,7 @@ class EmulatedStructuredLaws:
 
     def __call__(self, part, F, weights, g, blocks: int) -> list[torch.Tensor]:
         """Result, gradient of F (n, 3, 3) and gradients of the weights."""
-        name, constants = part.kernel
+        name, constants = part.network_kernel
         F, g, *weights = (x.to(self.dtype).contiguous() for x in (F, g, *weights))
         result, grad_F = (torch.full_like(F, torch.nan) for _ in range(2))
         partials = torch.full((blocks, structured_kernels.weight_count(name)), torch.nan, dtype=self.dtype)

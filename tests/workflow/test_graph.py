@@ -518,3 +518,13 @@ def test_cases_of_other_models_are_known_to_have_no_own_fit(tiny_settings):
     assert "it has no material law, so that it cannot move several bodies together" in str(caught.value)
     case = cases.case(tiny_settings(**TWO_VIDEOS), "Filmed_throw2", "neuma+law_from=Filmed")
     assert case.folder != case.name and f"{case.scene}/{case.name}" == "Filmed/neuma"
+
+
+def test_one_identification_uses_all_cores_and_several_share_them(project):
+    """The plans have two cores."""
+    scenes = [f"{RESULTS}/{name}/identified.json" for name in ("BouncyBall", "JellyDuck")]
+    changes = overlay(device="cpu", identify={"refined_particles": 0})
+    for targets, threads in ((scenes[:1], 2), (scenes, 1)):
+        jobs = project.plan(*changes, *targets).of_rule("identify")
+        assert len(jobs) == len(targets)
+        assert all(("threads: 2" in job.text) == (threads == 2) for job in jobs)

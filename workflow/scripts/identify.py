@@ -13,10 +13,12 @@ from neuma_lib.io.images import load_videos
 from neuma_lib.io.mesh import read_mesh
 from neuma_lib.io.particles import load_reconstruction
 from neuma_lib.io.simulator import simulator
+from neuma_lib.threads import use_threads
 from workflow.stage import run_script
 
 
 def main(inputs, output, params, run) -> None:
+    use_threads(snakemake.threads)
     settings, binding = IdentifyConfig(**params.identify), BindingConfig(**params.binding)
     device = choose_device(params.device)
     names = ("particles", "binding", "gaussians", "velocity", "transforms")

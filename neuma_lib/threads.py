@@ -1,0 +1,51 @@
+"""Independent pieces of work on several threads of Python, whose native code runs at the same time.
+
+One thread does a piece from start to end, so results do not depend on the number of threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
+
+import torch
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+_count = 1
+_loaded: set[Hashable] = set()
+
+
+def use_threads(count: int) -> None:
+    """Set the number of threads of `in_threads`, 1 by default. Torch keeps one, because its sums depend on theirs."""
+    global _count
+    _count = count
+    torch.set_num_threads(1)
+
+
+def thread_count() -> int:
+    """Number of threads of `in_threads`."""
+    return _count
+
+
+def in_threads(
+    work: Callable[[Item], Result], items: Sequence[Item], kernels: Hashable, count: int | None = None
+) -> list[Result]:
+    """Results of ``work`` for each of the items.
+
+    Args:
+        work: a function that releases Python's lock for most of its time. Torch's gradient mode is not inherited.
+        kernels: key of the kernels that it loads. One thread has to load them, hence the first item of a key is
+            processed alone.
+        count: number of threads, by default `thread_count`.
+    """
+    count = min(count or _count, len(items))
+    alone = len(items) if count < 2 else int(kernels not in _loaded)
+    results = [work(item) for item in items[:alone]]
+    _loaded.update([kernels] if results else [])
+    if alone < len(items):
+        with ThreadPoolExecutor(count) as executor:
+            results += executor.map(work, items[alone:])
+    return results
