@@ -17,7 +17,7 @@ class TableConfig(Section):
     experiments: tuple[str, ...] = Field((), description="columns after the scenes, in order")
     methods: tuple[str, ...] = Field((), description="rows, in order; also variants such as neuma+rank=4")
     titles: dict[str, str] = Field({}, description="names of rows by method, if not the methods' own")
-    note: str | None = Field(None, description="note below the table")
+    note: str | None = Field(None, description="text below the heading of the table")
     default_target: bool = Field(
         True,
         description="whether the targets `tables` and `all` include it; false: on request by its file name",

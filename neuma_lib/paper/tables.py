@@ -65,7 +65,7 @@ class Table(Frame):
         marks: (method, column) -> signs of `FOOTNOTES`, for runs that diverged.
         failures: a sentence for each prediction that stopped early.
         notes: method -> footnote.
-        note: footnote of the whole table.
+        note: text below the heading.
     """
 
     paper: PaperTable | None = None
@@ -94,8 +94,9 @@ class Table(Frame):
         return as_csv(lines)
 
     def markdown(self) -> str:
-        """RMSE of all methods, their Chamfer distances with the paper's, footnotes, and verdicts on claims."""
+        """Note, RMSE of all methods, their Chamfer distances with the paper's, footnotes, and verdicts on claims."""
         parts = [f"# {self.paper.heading}", ""] if self.paper else []
+        parts += [self.note, ""] if self.note else []
         parts += [*self._errors(), *self._distances()]
         paragraphs = [spread_note(max(len(row.runs) for row in self.rows.values()))]
         signs = "".join(self.marks.values())
@@ -103,7 +104,7 @@ class Table(Frame):
         if remarks := [*self.failures, *self.outliers()]:
             paragraphs.append("\n".join(f"- {line}" for line in remarks))
         notes = [f"{self._note_sign(method)} {note}" for method, note in self.notes.items()]
-        for paragraph in filter(None, [*paragraphs, self.absorbed(), *notes, self.note]):
+        for paragraph in filter(None, [*paragraphs, self.absorbed(), *notes]):
             parts += [paragraph, ""]
         if verdicts := self.verdicts():
             parts += [*verdict_lines(verdicts, VERDICTS[2], paper=True), RULE, ""]
@@ -225,7 +226,7 @@ def chamfer_table(
         columns: scene or experiment -> heading, in order.
         paper: the table of the paper to compare with.
         notes: method -> footnote.
-        note: footnote of the whole table.
+        note: text below the heading.
 
     Raises:
         InputError: there are no methods or columns, a method lacks a column, or a value is not finite.
