@@ -113,7 +113,7 @@ def identify(
         run.restart_from(run.family.with_guesses({**run.values, **best.values}))
     total = rounds * len(families)
     for level in range(1, rounds):
-        _prune(running, settings)
+        _prune(running, settings, keep_redundant=bool(refined))
         following = sorted((run for run in running if run.alive), key=lambda run: run.fit.cost)
         if following and level == rounds - 1:
             following[0].differentiate()
@@ -261,19 +261,19 @@ def _better_later(running: Sequence[FamilyRun]) -> list[tuple[FamilyRun, FamilyR
     return pairs
 
 
-def _prune(running: Sequence[FamilyRun], settings: IdentifyConfig) -> None:
+def _prune(running: Sequence[FamilyRun], settings: IdentifyConfig, keep_redundant: bool = False) -> None:
     """Drop redundant families, and those whose loss exceeds ``prune_factor`` times the best with their return map.
 
     Return maps are not compared, because the error of a coarse grid, at thin limbs and near the floor, is like plastic
     flow. Families that do not improve on a simpler one at a coarse level are kept, since finer levels have more
-    information.
+    information, and redundant ones with ``keep_redundant``, for a finer grid.
     """
     alive = [run for run in running if run.alive]
     for run in alive:
         lowest = min(other.fit.cost for other in alive if other.family.return_map == run.family.return_map)
         run.alive = run.fit.cost <= settings.prune_factor * lowest
     kept = [run for run in alive if run.alive]
-    for run in [run for run in kept if _is_redundant(run, kept)]:
+    for run in [] if keep_redundant else [run for run in kept if _is_redundant(run, kept)]:
         run.alive = False
 
 

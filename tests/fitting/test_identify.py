@@ -309,6 +309,8 @@ def test_families_with_a_high_cost_and_redundant_ones_are_pruned():
     never_yields, flat = FakeRun(0.99, PLASTIC, "soft"), FakeRun(1.2, FLUID, "flat")
     sibling = FakeRun(1.0, law("fixed_corotated"), "soft")
     runs = [elastic, far, never_yields, flat, sibling]
+    _prune(runs, options, keep_redundant=True)
+    assert [run.alive for run in runs] == [True, False, True, True, True]
     _prune(runs, options)
     assert [run.alive for run in runs] == [True, False, False, True, True]
     grains = FakeRun(1.0, law("hencky", "drucker_prager", friction_angle=30), "soft")

@@ -1,18 +1,5 @@
 """Family and constants of the material in the video: a start of training, or a law."""
 
-
-def identify_threads(wildcards):
-    """All cores for one identification, an equal share of them for several, at least one.
-
-    Identifications side by side use cores better than threads, which wait for each other after each batch of rollouts.
-    A GPU and the jobs of a cluster need one core.
-    """
-    if GPU or not (workflow.is_main_process and workflow.local_exec):
-        return 1
-    jobs = sum(job.rule.name in ("identify", "identify_views") for job in workflow.dag.needrun_jobs())
-    return max(1, workflow.cores // max(1, jobs))
-
-
 # A file that names its views is for methods that train on other views than the rest.
 for views in ("", "+views={views}"):
 

@@ -273,3 +273,15 @@ def viewer_files(wildcards):
     """Files and settings of a scene for the viewer in a file."""
     methods = cases.moving_methods(SETTINGS, wildcards.scene, SETTINGS.viewer.methods)
     return replace(scene_files(SETTINGS, wildcards.scene, methods), velocity=None)
+
+
+def identify_threads(wildcards):
+    """All cores for one identification, an equal share of them for several, at least one.
+
+    Identifications side by side use cores better than threads, which wait for each other after each batch of rollouts.
+    A GPU and the jobs of a cluster need one core.
+    """
+    if GPU or not (workflow.is_main_process and workflow.local_exec):
+        return 1
+    jobs = sum(job.rule.name in ("identify", "identify_views") for job in workflow.dag.needrun_jobs())
+    return max(1, workflow.cores // max(1, jobs))
