@@ -127,12 +127,12 @@ class OwnRollout:
         return self.x.detach().numpy(), self.state.v.grad.numpy()
 
 
-def timed(work: Callable[[], object]) -> float:
-    """Wall seconds of the second of two calls. The first fills the caches that other engines have used meanwhile."""
+def timed(work: Callable[[], object]) -> tuple[float, float]:
+    """Core and wall seconds of the second of two calls. The first fills the caches that other engines have used."""
     work()
-    started = time.perf_counter()
+    started = time.process_time(), time.perf_counter()
     work()
-    return time.perf_counter() - started
+    return time.process_time() - started[0], time.perf_counter() - started[1]
 
 
 def engine_for(name: str, case: Case) -> Engine:

@@ -18,7 +18,7 @@ class Fixed:
     """An engine with a given result that takes a given time."""
 
     def __init__(self, name, result, seconds=0.004):
-        self.name, self.result, self.time = name, result, seconds
+        self.name, self.result, self.time = name, result, (seconds, seconds)
 
     def prepare(self, case):
         return self.result
@@ -80,10 +80,11 @@ def test_engines_that_differ_are_not_timed(own, part, by):
 
 
 def test_a_table_has_times_of_a_step_and_paired_ratios():
-    times = {(peers.OWN, "forward"): [0.1, 0.2, 0.4], ("other", "forward"): [0.3, 0.2, 0.8]}
+    own, other = [(0.1, 0.5), (0.2, 0.5), (0.4, 0.6)], [(0.3, 0.3), (0.2, 0.4), (0.8, 0.9)]
+    times = {(peers.OWN, "forward"): own, ("other", "forward"): other}
     first, second = (line.split() for line in peers.table(times, steps=100).splitlines()[1:])
-    assert first[3:] == ["2.000", "1.000", "1.00", "1.00", "to", "1.00"]
-    assert second[2:] == ["3.000", "2.000", "2.00", "1.00", "to", "3.00"]
+    assert first[3:] == ["2.000", "1.000", "5.000", "1.00", "1.00", "to", "1.00"]
+    assert second[2:] == ["3.000", "2.000", "4.000", "2.00", "1.00", "to", "3.00"]
 
 
 def test_missing_engines_are_refused(monkeypatch, tmp_path):
