@@ -74,6 +74,7 @@ class TaichiRollout:
 
         With columns a, b and c of A this is w_i (q + i a + j b + k c).
         """
+        ti.loop_config(serialize=True)  # on one thread, without which all additions are atomic
         for p in range(self.x.shape[1]):
             F = self.F[s, p]
             tau = self.mu * (F @ F.transpose()) + ti.Matrix.identity(ti.f32, 3) * (
@@ -104,6 +105,7 @@ class TaichiRollout:
     @ti.kernel
     def g2p(self, s: ti.i32):
         """v = sum w_i v_i,  C = (4 / dx) sum w_i v_i d_i^T,  x += dt v,  F = (I + dt C) F."""
+        ti.loop_config(serialize=True)  # on one thread, without which all additions are atomic
         for p in range(self.x.shape[1]):
             cells = self.x[s, p] * self.n
             base = ti.cast(cells - 0.5, ti.i32)
