@@ -11,7 +11,7 @@ from tests.support.project import ROOT, SCENE, Plan, Project, overlay
 
 RESULTS = SCENE.rpartition("/")[0]
 EXPERIMENTS = f"{RESULTS}/experiments"
-LONG = f"{SCENE}/neuma+iterations=60+checkpoint_every=1/adaptor.safetensors"
+LONG = f"{SCENE}/neuma+iterations=600+checkpoint_every=1+lr_scale=0.05/adaptor.safetensors"
 OWN_PARTICLES = f"{SCENE}/pac_nerf_own+views=0,1"
 OWN_TABLE, REPLICATES = f"{RESULTS}/own.csv", f"{RESULTS}/replicates.csv"
 CUBIC = "tiny/data/Cubic/truth.h5"

@@ -305,7 +305,7 @@ def test_a_killed_training_and_a_killed_snakemake_resume_with_the_same_result(cl
     assert snakemake.wait(60) != 0 and not list(clone.root.glob(".snakemake/locks/*"))
 
     snakemake, training = started_training(clone)
-    assert re.search(r"resumed at iteration \d+ of 60", (clone.root / "started.log").read_text())
+    assert re.search(r"resumed at iteration \d+ of 600", (clone.root / "started.log").read_text())
     busy = subprocess.run(make, cwd=clone.root, capture_output=True, text=True)
     assert busy.returncode != 0 and f"process {snakemake.pid}" in busy.stdout
     assert f"Another Snakemake is at work in this folder (process {snakemake.pid}" in clone.run(
@@ -318,7 +318,7 @@ def test_a_killed_training_and_a_killed_snakemake_resume_with_the_same_result(cl
     assert "unlock" in clone.run(full_run.LONG, succeeds=False)
     wait_for(lambda: subprocess.run(make, cwd=clone.root, capture_output=True).returncode == 0, 20)
 
-    assert re.search(r"resumed at iteration \d+ of 60", clone.run(full_run.LONG))
+    assert re.search(r"resumed at iteration \d+ of 600", clone.run(full_run.LONG))
     assert not (folder / "checkpoint.pt").exists()
     assert not (full.root / full_run.LONG).with_name("checkpoint.pt").exists()
     assert (clone.root / full_run.LONG).read_bytes() == (full.root / full_run.LONG).read_bytes()
