@@ -14,9 +14,8 @@ from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.fitting.families import FRICTION, Family
 from neuma_lib.mechanics.combinations import Values, named_combinations, physical
 
-_ASYMPTOTIC = math.log(
-    2
-)  # largest change of a logarithm or logit between grids that the order of convergence explains
+_ASYMPTOTIC = math.log(2)
+"""Largest change of a logarithm or logit between grids that the order of convergence explains."""
 
 
 @dataclass

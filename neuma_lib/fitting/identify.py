@@ -126,6 +126,7 @@ def identify(
     compared, fine = fits, {}
     if refined:
         fine = _on_finer_grid(running, fits, videos, settings)
+    if any(each.alive for each in fine.values()):
         compared = {name: each.score() for name, each in fine.items()}
         _log_fits(compared.values(), " on the finer grid", log)
     selected, ties = _select(list(compared.values()), settings)
@@ -149,7 +150,7 @@ def identify(
         final = FamilyRun(sticking, videos, counts, settings)
         final.begin(start[:1], rounds - 1, start[1])
     material = None
-    if refined and final.alive:
+    if name in fine and fine[name].alive and final.alive:
         final.refine(rounds - 1, closely=True)
         whole = FamilyRun(final.family, videos, counts, settings, fine=True)
         starts = [{key: each[key] for key in final.values} for each in (fine[name].values, final.values)]

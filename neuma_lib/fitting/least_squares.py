@@ -62,8 +62,8 @@ class Residuals(Protocol):
         """Sum of squares, infinite if there is no image."""
 
     def linearise(self, unknowns: np.ndarray, free: Sequence[int], exact: bool = True) -> Linearisation:
-        """The problem linearised at unknowns with a finite cost; columns that are not free are 0. J need not be exact
-        unless it has to."""
+        """The problem linearised at unknowns with a finite cost; columns that are not free are 0. Unless ``exact``, J
+        may be updated from that at a former point."""
 
 
 def in_blocks(values: Tensor) -> Tensor:

@@ -249,6 +249,13 @@ def test_the_finer_grid_decides_between_families_of_similar_scores(monkeypatch):
     alone = identify(MODEL, known(body), body, seen, options)
     assert alone.best.family.name == "hencky" and alone.material is None
 
+    begin = FamilyRun.begin
+    monkeypatch.setattr(
+        FamilyRun, "begin", lambda run, *given, **options: run._fine or begin(run, *given, **options)
+    )
+    coarse_only = identify(MODEL, known(body), body, seen, options, refined=[body])
+    assert coarse_only.best.family.name == "hencky" and coarse_only.material is None
+
 
 @pytest.mark.parametrize("refinement", [2, 3])
 def test_an_extrapolation_covers_both_orders_of_convergence(refinement):
