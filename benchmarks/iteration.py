@@ -83,7 +83,7 @@ def simulation_parts(scene: BenchmarkScene, device: torch.device) -> list[Part]:
     elastic, plastic = flat[:3], flat[3:]
     plan = MemoryPlan(segment=2, caches_steps=True, law_cache_bytes=math.inf)
     sim = Simulation(scene.model, bodies, slices, scene.body.state(scene.v0), steps=2, plan=plan)
-    sim.run((path.x[0], path.v[0], path.F[0], path.C[0]), flat, (2,))
+    sim.run((path.x[0], path.v[0], path.F[0], path.C[0], path.stuck[0]), flat, (2,))
     ws = sim.workspace
     F, F_trial, tau = ws.F[0], ws.F_trial[0], ws.tau[0]
     for grad in (ws.grad_x, ws.grad_v, ws.grad_C, ws.grad_F):

@@ -56,7 +56,7 @@ def adjoint_kernels(
     contact, clamps = "contact" in features, "clamps" in features
     Hold, held, _ = hold_type(dtype), *vars(clamp_functions(dtype)).values()
     t, functions = warp_types(dtype), grid_functions(dtype)
-    Obstacle, touching = obstacle_type(dtype), contact_functions(dtype, "meshes" in features)
+    Obstacle, touching = obstacle_type(dtype), contact_functions(dtype, features)
     touch, touch_adjoint = touching.contact, touching.contact_adjoint
     ordered = scatter != "atomic"
     run_of, deposit = scatter_functions(dtype, scatter, 3)

@@ -20,7 +20,8 @@ start_warp()
 CODES = {shape: code for code, shape in enumerate(SIZES)}
 STICKING = 1e12
 """Finite coefficient in place of infinity, whose adjoint would be infinity times zero."""
-PLANE, BOX, CAPSULE, MESH = CODES["plane"], CODES["box"], CODES["capsule"], CODES["mesh"]
+BOX, CAPSULE, MESH = CODES["box"], CODES["capsule"], CODES["mesh"]
+ROUND = (CODES["sphere"], CAPSULE)
 
 
 @functools.cache
@@ -78,8 +79,8 @@ def obstacles(colliders: Sequence[Collider], times: Sequence[float], dtype: torc
 
 
 @functools.cache
-def contact_functions(dtype: torch.dtype, meshes: bool = False) -> SimpleNamespace:
-    """Functions `contact` and `contact_adjoint` for a precision, and with or without colliders of a mesh.
+def contact_functions(dtype: torch.dtype, features: tuple[str, ...] = ()) -> SimpleNamespace:
+    """Functions `contact` and `contact_adjoint` for a precision and for planes and the shapes among the features.
 
     ``contact(obstacles, distances, pose, faces, dt, x, v, s, r)`` gives the velocity v and the tangential displacement
     s of a particle at x of radius r after contact with the obstacles of row ``pose``, and whether it touches one. The
@@ -89,6 +90,8 @@ def contact_functions(dtype: torch.dtype, meshes: bool = False) -> SimpleNamespa
     real = {torch.float32: wp.float32, torch.float64: wp.float64}[dtype]
     vec3, vec11 = (wp.types.vector(length=n, dtype=real) for n in (3, 11))
     Obstacle = obstacle_type(dtype)
+    boxes, meshes = "box" in features, "mesh" in features
+    rounded = "sphere" in features or "capsule" in features
 
     @wp.func
     def corners(o: Obstacle, distances: wp.array(dtype=real), x: vec3):
@@ -121,28 +124,29 @@ def contact_functions(dtype: torch.dtype, meshes: bool = False) -> SimpleNamespa
         # outward normal in the frame of the obstacle, and signed distance
         normal = vec3(zero, one, zero)
         distance = y[1]
-        if o.shape == wp.static(BOX):
-            sign = vec3(
-                wp.where(y[0] < zero, -one, one),
-                wp.where(y[1] < zero, -one, one),
-                wp.where(y[2] < zero, -one, one),
-            )
-            q = wp.cw_mul(sign, y) - o.size
-            if wp.max(q) > zero:
-                beyond = vec3(wp.max(q[0], zero), wp.max(q[1], zero), wp.max(q[2], zero))
-                distance = wp.length(beyond)
-                normal = wp.cw_mul(sign, beyond) / distance
-            elif q[0] >= q[1] and q[0] >= q[2]:
-                normal = vec3(sign[0], zero, zero)
-                distance = q[0]
-            elif q[1] >= q[2]:
-                normal = vec3(zero, sign[1], zero)
-                distance = q[1]
-            else:
-                normal = vec3(zero, zero, sign[2])
-                distance = q[2]
-        elif o.shape == wp.static(MESH):
-            if wp.static(meshes):  # see `DistanceGrid`
+        if wp.static(boxes):
+            if o.shape == wp.static(BOX):
+                sign = vec3(
+                    wp.where(y[0] < zero, -one, one),
+                    wp.where(y[1] < zero, -one, one),
+                    wp.where(y[2] < zero, -one, one),
+                )
+                q = wp.cw_mul(sign, y) - o.size
+                if wp.max(q) > zero:
+                    beyond = vec3(wp.max(q[0], zero), wp.max(q[1], zero), wp.max(q[2], zero))
+                    distance = wp.length(beyond)
+                    normal = wp.cw_mul(sign, beyond) / distance
+                elif q[0] >= q[1] and q[0] >= q[2]:
+                    normal = vec3(sign[0], zero, zero)
+                    distance = q[0]
+                elif q[1] >= q[2]:
+                    normal = vec3(zero, sign[1], zero)
+                    distance = q[1]
+                else:
+                    normal = vec3(zero, zero, sign[2])
+                    distance = q[2]
+        if wp.static(meshes):  # see `DistanceGrid`
+            if o.shape == wp.static(MESH):
                 high = o.size + o.spacing * vec3(
                     real(o.nodes[0] - 1), real(o.nodes[1] - 1), real(o.nodes[2] - 1)
                 )
@@ -177,17 +181,18 @@ def contact_functions(dtype: torch.dtype, meshes: bool = False) -> SimpleNamespa
                     distance = wp.sqrt(wp.length_sq(beyond) + distance * distance)
                 if wp.length_sq(slope) > zero:
                     normal = slope / wp.length(slope)
-        elif o.shape != wp.static(PLANE):
-            along = zero
-            radius = o.size[0]
-            if o.shape == wp.static(CAPSULE):
-                along = wp.clamp(y[1], -o.size[0], o.size[0])
-                radius = o.size[1]
-            from_axis = vec3(y[0], y[1] - along, y[2])
-            length = wp.length(from_axis)
-            distance = length - radius
-            if length > zero:
-                normal = from_axis / length
+        if wp.static(rounded):
+            if o.shape == wp.static(ROUND[0]) or o.shape == wp.static(ROUND[1]):
+                along = zero
+                radius = o.size[0]
+                if o.shape == wp.static(CAPSULE):
+                    along = wp.clamp(y[1], -o.size[0], o.size[0])
+                    radius = o.size[1]
+                from_axis = vec3(y[0], y[1] - along, y[2])
+                length = wp.length(from_axis)
+                distance = length - radius
+                if length > zero:
+                    normal = from_axis / length
         gap = distance - r
         after = v
         stuck = s
@@ -221,6 +226,12 @@ def contact_functions(dtype: torch.dtype, meshes: bool = False) -> SimpleNamespa
         return wp.where(inside, faces, 0)
 
     @wp.func
+    def near(faces: wp.int32, k: wp.int32, x: vec3, r: real):
+        """Whether the particle may touch obstacle k: whether it is as near to a face of the cube (`WALLS`)."""
+        place = x[k / 2 % 3]
+        return k >= faces or wp.where(k % 2 == 0, place, real(1.0) - place) < r
+
+    @wp.func
     def contact(
         obstacles: wp.array2d(dtype=Obstacle),
         distances: wp.array(dtype=real),
@@ -236,12 +247,13 @@ def contact_functions(dtype: torch.dtype, meshes: bool = False) -> SimpleNamespa
         stuck = s
         touches = wp.int32(0)
         for k in range(first_near(faces, x, r), obstacles.shape[1]):
-            d = corners(obstacles[pose, k], distances, x)
-            changed, moved = touched(obstacles[pose, k], d, dt, x, after, stuck, r)
-            if wp.length_sq(changed - after) > real(0.0):
-                touches = 1
-            after = changed
-            stuck = moved
+            if near(faces, k, x, r):
+                d = corners(obstacles[pose, k], distances, x)
+                changed, moved = touched(obstacles[pose, k], d, dt, x, after, stuck, r)
+                if wp.length_sq(changed - after) > real(0.0):
+                    touches = 1
+                after = changed
+                stuck = moved
         if touches == 0:
             stuck = vec3()
         return after, stuck, touches
@@ -265,20 +277,22 @@ def contact_functions(dtype: torch.dtype, meshes: bool = False) -> SimpleNamespa
         g_v = g_after
         g_s = g_stuck
         for done in range(last + 1 - first):
-            before = v
-            stuck = s
-            for k in range(first, last - done):
-                d = corners(obstacles[pose, k], distances, x)
-                moved_v, moved_s = touched(obstacles[pose, k], d, dt, x, before, stuck, r)
-                before = moved_v
-                stuck = moved_s
-            d = corners(obstacles[pose, last - done], distances, x)
-            _o, _d, _dt, by_x, by_v, by_s, _r, _g, _h = wp.grad(weighted)(
-                obstacles[pose, last - done], d, dt, x, before, stuck, r, g_v, g_s
-            )
-            g_x = g_x + by_x
-            g_v = by_v
-            g_s = by_s
+            if near(faces, last - done, x, r):
+                before = v
+                stuck = s
+                for k in range(first, last - done):
+                    if near(faces, k, x, r):
+                        d = corners(obstacles[pose, k], distances, x)
+                        moved_v, moved_s = touched(obstacles[pose, k], d, dt, x, before, stuck, r)
+                        before = moved_v
+                        stuck = moved_s
+                d = corners(obstacles[pose, last - done], distances, x)
+                _o, _d, _dt, by_x, by_v, by_s, _r, _g, _h = wp.grad(weighted)(
+                    obstacles[pose, last - done], d, dt, x, before, stuck, r, g_v, g_s
+                )
+                g_x = g_x + by_x
+                g_v = by_v
+                g_s = by_s
         return g_x, g_v, g_s
 
     return SimpleNamespace(contact=contact, contact_adjoint=contact_adjoint)

@@ -281,11 +281,11 @@ def forward_kernels(
     dtype: torch.dtype, scatter: str = "atomic", features: tuple[str, ...] = ()
 ) -> SimpleNamespace:
     """Kernels `cells`, `p2g`, `grid_update` and `g2p` for a precision, a scatter method and features of the model:
-    "contact" of particles, "meshes" that they touch, and "clamps"."""
+    "contact" of particles, shapes that they touch beside planes, and "clamps"."""
     contact, clamps = "contact" in features, "clamps" in features
     Hold, held, prescribed = hold_type(dtype), *vars(clamp_functions(dtype)).values()
     t, functions = warp_types(dtype), grid_functions(dtype)
-    Obstacle, touch = obstacle_type(dtype), contact_functions(dtype, "meshes" in features).contact
+    Obstacle, touch = obstacle_type(dtype), contact_functions(dtype, features).contact
     ordered = scatter != "atomic"
     run_of, deposit = scatter_functions(dtype, scatter, 4)
     real, vec3, vec4, mat33, mat34, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.mat34, t.GridConstants
@@ -430,7 +430,7 @@ def forward_kernels(
 
 @functools.cache
 def deformation_kernels(dtype: torch.dtype) -> SimpleNamespace:
-    """Kernels `trial_deformation`, `total_adjoint` and `advect_tracers` for a precision."""
+    """Kernels `trial_deformation`, `total_adjoint`, `advect_tracers` and `add_gradients` for a precision."""
     t, functions = warp_types(dtype), grid_functions(dtype)
     real, vec3, vec4, mat33, mat34, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.mat34, t.GridConstants
     stencil, moved = functions.stencil, functions.moved
@@ -485,6 +485,32 @@ def deformation_kernels(dtype: torch.dtype) -> SimpleNamespace:
         grad_C[p] = grad_C[p] + c.dt * (g * wp.transpose(F_total[now, p]))
         grad_F_total[p] = g + c.dt * (wp.transpose(C[after, p]) * g)
 
+    @kernel
+    def add_gradients(
+        c: GridConstants,
+        frame_of_x: wp.int32,
+        frame_of_F: wp.int32,
+        added_x: wp.array2d(dtype=real),
+        added_F: wp.array2d(dtype=real),
+        grad_F_elastic: wp.array(dtype=real),
+        grad_x: wp.array(dtype=real),
+        grad_F: wp.array(dtype=real),
+    ):
+        """Add the gradient of F from elasticity, and those of x and F at a frame unless its index is -1.
+
+        A thread adds single numbers, so that neighbours in a warp access neighbours in memory.
+        """
+        k = wp.tid()
+        total = grad_F[k] + grad_F_elastic[k]
+        if frame_of_F >= 0:
+            total = total + added_F[frame_of_F, k]
+        grad_F[k] = total
+        if frame_of_x >= 0 and k < grad_x.shape[0]:
+            grad_x[k] = grad_x[k] + added_x[frame_of_x, k]
+
     return SimpleNamespace(
-        trial_deformation=trial_deformation, total_adjoint=total_adjoint, advect_tracers=advect_tracers
+        add_gradients=add_gradients,
+        trial_deformation=trial_deformation,
+        total_adjoint=total_adjoint,
+        advect_tracers=advect_tracers,
     )

@@ -216,8 +216,10 @@ class Simulation:
         return tuple(total.clone() for total in totals), [grad.clone() for grad in grad_weights]
 
     def step_adjoint(self, n: int, weights: Sequence[Tensor], sums: Mapping[str, Sequence[Weights]]) -> None:
-        """From gradients of state n + 1, in the workspace, to those of state n. Gradients of the weights are added to
-        `sums`, the `Constitutive.accumulators` of all regions by part of the law."""
+        """From gradients of state n + 1, in the workspace, to those of state n, whose grad_F lacks grad_F_elastic.
+
+        Gradients of the weights are added to `sums`, the `Constitutive.accumulators` of all regions by part of the law.
+        """
         ws = self.workspace
         cached = ws.cached_at(n)
         F, F_trial = ws.F[ws.at(n)], ws.F_trial[cached]
@@ -229,7 +231,6 @@ class Simulation:
         self._vjp("plasticity", n, F_trial, weights, ws.grad_F, ws.grad_F_trial, sums)
         ws.transfer_adjoint(n)
         self._vjp("elasticity", n, F, weights, ws.grad_tau, ws.grad_F_elastic, sums)
-        ws.grad_F.add_(ws.grad_F_elastic)
 
     def _segments(self, frames: Sequence[int]) -> list[tuple[int, int]]:
         """First step and number of steps of each segment."""
@@ -270,6 +271,7 @@ class Simulation:
                     passive.store(first + n)
             return
         with self.workspace.stream():
+            self.workspace.start_segment()
             for n in range(steps):
                 self.step(n, weights)
                 if passive:
@@ -305,9 +307,11 @@ class Simulation:
             }
             if self._loop:
                 self._loop.start_reverse(steps, self._before(index))
+            else:
+                add = ws.gradient_sum(added)
             n = steps
             while n > 0:
-                if n in frame_of:
+                if n in frame_of and (self._loop or n == steps):
                     for total, grad in zip(totals, added, strict=True):
                         if grad is not None:
                             total.add_(grad[frame_of[n]])
@@ -316,6 +320,7 @@ class Simulation:
                     self._loop.reverse(n - 1, n - before)
                 else:
                     self.step_adjoint(before, weights, sums)
+                    add(frame_of.get(before, -1))
                 n = before
             if self._loop and index == 0:
                 self._loop.end()

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import threading
 import weakref
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
@@ -20,7 +20,7 @@ from torch import Tensor
 from neuma_lib.sim import kernels
 from neuma_lib.sim.adjoint_kernels import adjoint_kernels
 from neuma_lib.sim.clamp_kernels import hold_type, holds
-from neuma_lib.sim.colliders import contact_radius
+from neuma_lib.sim.colliders import SIZES, contact_radius
 from neuma_lib.sim.contact_kernels import STICKING, distances, obstacle_type, obstacles
 from neuma_lib.sim.graphs import MAX_GRAPHS, GraphCache
 from neuma_lib.sim.kernels import NO_FAULT, deformation_kernels, forward_kernels, warp_types
@@ -270,13 +270,19 @@ class Workspace:
         """Drop graphs together with the buffers that they read."""
         self._frame_grads, self.graphs = {}, GraphCache()
 
+    def start_segment(self) -> None:
+        """Call it before the steps of a segment: it clears the nodes, to which particles add."""
+        if not self.native and self.size.n_cached_steps > 1:
+            self.grid.zero_()
+
     def transfer_to_grid(self, step: int) -> None:
         """From tau and the state of a step to the velocities of the nodes."""
         if self.native:
             self.native.run("to_grid", step)
             return
         cached = self.cached_at(step)
-        self.grid[cached].zero_()
+        if self.size.n_cached_steps == 1:  # else `start_segment` clears those of all steps at once
+            self.grid[cached].zero_()
         if self.size.model.clamps:
             self.held_mass.zero_()
             self.held_by.zero_()
@@ -328,6 +334,34 @@ class Workspace:
         _run(self._grid_adjoint, cached, side)
         _run(self._p2g_adjoint, now, cached, side, self.pose_at(step))
 
+    def gradient_sum(self, added: Sequence[Tensor | None]) -> Callable[[int], None]:
+        """A function that adds grad_F_elastic to grad_F, and the gradients of a frame to `grad_states`.
+
+        Args:
+            added: gradients of each state at the frames, shape (T, N, ...). The function takes the index of a frame, or
+                -1 for none.
+        """
+        given = [None if added[k] is None else added[k].contiguous() for k in (0, 2)]
+        arrays = [
+            wp.from_torch((unused if grad is None else grad).flatten(1))
+            for grad, unused in zip(given, (self.x, self.F), strict=True)
+        ]
+        own = self.grad_x, self.grad_F
+        flat = [wp.from_torch(total.flatten()) for total in (self.grad_F_elastic, *own)]
+        launch = self.record(self._deformation.add_gradients, 9 * self.size.particles, 0, 0, *arrays, *flat)
+        others = [
+            (total, grad)
+            for total, grad in zip(self.grad_states, added, strict=True)
+            if grad is not None and not any(total is one for one in own)
+        ]
+
+        def add(frame: int) -> None:
+            _run(launch, *(-1 if grad is None else frame for grad in given))
+            for total, grad in others if frame >= 0 else ():
+                total.add_(grad[frame])
+
+        return add
+
     @contextmanager
     def stream(self) -> Iterator[None]:
         """Launch on torch's current stream, so that launches of torch and Warp are ordered."""
@@ -377,10 +411,10 @@ class Workspace:
     @property
     def features(self) -> tuple[str, ...]:
         """Features of the model for the kernels."""
-        meshes = any(collider.distances for collider in self.size.model.colliders)
+        shapes = {collider.shape for collider in self.size.model.obstacles}
         has = {
             "contact": self._contact,
-            "meshes": meshes,
+            **{shape: self._contact and shape in shapes for shape in SIZES if shape != "plane"},
             "clamps": bool(self.size.model.clamps),
             "walls": self.size.scatter == "native" and self.size.model.wall_nodes > 0,
         }
