@@ -281,7 +281,7 @@ def forward_kernels(
     dtype: torch.dtype, scatter: str = "atomic", features: tuple[str, ...] = ()
 ) -> SimpleNamespace:
     """Kernels `cells`, `p2g`, `grid_update` and `g2p` for a precision, a scatter method and features of the model:
-    "contact" of particles, shapes that they touch beside planes, and "clamps"."""
+    "contact" of particles, shapes other than planes that they touch, and "clamps"."""
     contact, clamps = "contact" in features, "clamps" in features
     Hold, held, prescribed = hold_type(dtype), *vars(clamp_functions(dtype)).values()
     t, functions = warp_types(dtype), grid_functions(dtype)
