@@ -283,8 +283,8 @@ def rasterized_error(
 ) -> torch.Tensor:
     """Mean squared difference of each rendered frame from the observation (paper Eq. 2).
 
-    Equals ``mean_squared_error(rasterize(...)[0], observed)`` and has the same gradients. For observations as uint8, the
-    compositor computes it without storing images, with sums in another order (on CUDA in float32 only).
+    Equals ``mean_squared_error(rasterize(...)[0], observed)`` and has the same gradients. For observations as uint8,
+    the compositor computes it without storing images, with sums in another order (on CUDA in float32 only).
 
     Args:
         observed: see `mean_squared_error`.
