@@ -2,10 +2,11 @@
 particle.
 
 Both directions gather through a sparse matrix in CSR format, without atomic additions, so the result is deterministic.
-Both sum rows of twelve contiguous numbers, a vector and a matrix (the vector and a zero if F needs no gradient); a
-thread sums four columns. Memory accesses are coalesced: neighbouring threads read one row, 16 bytes each in float32,
-and write neighbouring results. Frames are the slow index, so the rows of a frame stay in the cache while all its
-Gaussians read them, about seven times each.
+Both sum rows of twelve contiguous numbers, a vector and a matrix (the vector and a zero if F needs no gradient).
+
+On a CPU one native loop per frame packs, sums and deforms. On a GPU a thread sums four columns. Memory accesses are
+coalesced: neighbouring threads read one row, 16 bytes each in float32, and write neighbouring results. Frames are the
+slow index, so the rows of a frame stay in the cache while all its Gaussians read them, about seven times each.
 """
 
 # No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
@@ -25,9 +26,79 @@ PARTS = 3
 
 
 @functools.cache
+def frame_kernels(dtype: torch.dtype) -> SimpleNamespace:
+    """Kernels ``forward`` and ``backward`` of a dtype on a CPU, over frames, which run one after the other."""
+    real, _, _ = warp_types(dtype)
+    module = wp.get_module(f"{__name__}.frames.{str(dtype).removeprefix('torch.')}")
+    text = native_source(__file__, ".h")
+    start = text["frames"].replace("REAL", {torch.float32: "float", torch.float64: "double"}[dtype])
+
+    @wp.func_native(start + text["forward"])
+    def forward_native(
+        frame: int, count: int, particles: int,
+        indptr: wp.array(dtype=int), indices: wp.array(dtype=int), weights: wp.array(dtype=real),
+        means: wp.array2d(dtype=real), covars: wp.array3d(dtype=real), arms: wp.array2d(dtype=real),
+        x0: wp.array2d(dtype=real), x: wp.array3d(dtype=real), F: wp.array4d(dtype=real),
+        scratch: wp.array2d(dtype=real), sums: wp.array3d(dtype=real),
+        moved: wp.array3d(dtype=real), stretched: wp.array4d(dtype=real),
+    ): ...  # fmt: skip
+
+    @wp.func_native(start + text["backward"])
+    def backward_native(
+        frame: int, count: int, particles: int,
+        indptr: wp.array(dtype=int), indices: wp.array(dtype=int), weights: wp.array(dtype=real),
+        covars: wp.array3d(dtype=real), arms: wp.array2d(dtype=real), sums: wp.array3d(dtype=real),
+        grad_moved: wp.array3d(dtype=real), grad_stretched: wp.array4d(dtype=real), scratch: wp.array2d(dtype=real),
+        grad_x: wp.array3d(dtype=real), grad_F: wp.array4d(dtype=real),
+    ): ...  # fmt: skip
+
+    @wp.kernel(enable_backward=False, module=module)
+    def forward(
+        indptr: wp.array(dtype=int),  # (G + 1,) rows of B
+        indices: wp.array(dtype=int),
+        weights: wp.array(dtype=real),
+        means: wp.array2d(dtype=real),  # (G, 3)
+        covars: wp.array3d(dtype=real),  # (G, 3, 3)
+        arms: wp.array2d(dtype=real),  # (G, 3) or None
+        x0: wp.array2d(dtype=real),  # (N, 3)
+        x: wp.array3d(dtype=real),  # (T, N, 3)
+        F: wp.array4d(dtype=real),  # (T, N, 3, 3)
+        scratch: wp.array2d(dtype=real),  # (N, 12)
+        sums: wp.array3d(dtype=real),  # (T, G, 12) or None, out: mean shift and mean F of the particles
+        moved: wp.array3d(dtype=real),  # (T, G, 3), out
+        stretched: wp.array4d(dtype=real),  # (T, G, 3, 3), out
+    ):
+        forward_native(
+            wp.tid(), moved.shape[1], x0.shape[0], indptr, indices, weights, means, covars, arms, x0, x, F, scratch,
+            sums, moved, stretched,
+        )  # fmt: skip
+
+    @wp.kernel(enable_backward=False, module=module)
+    def backward(
+        indptr: wp.array(dtype=int),  # (N + 1,) rows of B^T
+        indices: wp.array(dtype=int),
+        weights: wp.array(dtype=real),
+        covars: wp.array3d(dtype=real),  # (G, 3, 3)
+        arms: wp.array2d(dtype=real),  # (G, 3) or None
+        sums: wp.array3d(dtype=real),  # (T, G, 12), result of `forward`; None if F needs no gradient
+        grad_moved: wp.array3d(dtype=real),  # (T, G, 3)
+        grad_stretched: wp.array4d(dtype=real),  # (T, G, 3, 3)
+        scratch: wp.array2d(dtype=real),  # (G, 12), (G, 4) if F needs no gradient
+        grad_x: wp.array3d(dtype=real),  # (T, N, 3), out
+        grad_F: wp.array4d(dtype=real),  # (T, N, 3, 3), out; None if F needs no gradient
+    ):
+        backward_native(
+            wp.tid(), grad_moved.shape[1], grad_x.shape[1], indptr, indices, weights, covars, arms, sums, grad_moved,
+            grad_stretched, scratch, grad_x, grad_F,
+        )  # fmt: skip
+
+    return SimpleNamespace(forward=forward, backward=backward)
+
+
+@functools.cache
 def kernels(dtype: torch.dtype) -> SimpleNamespace:
-    """Kernels for a dtype. A thread processes one frame and: a part of a row (`pack`, `weighted_sums`), a coordinate of
-    a Gaussian (`carry`), or a Gaussian (`stretch_adjoint`).
+    """Kernels for a dtype on a GPU. A thread processes one frame and: a part of a row (`pack`, `weighted_sums`), a
+    coordinate of a Gaussian (`carry`), or a Gaussian (`stretch_adjoint`).
     """
     real, vec3, mat33 = warp_types(dtype)
     vec4 = wp.types.vector(length=4, dtype=real)

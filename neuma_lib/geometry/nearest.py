@@ -44,6 +44,13 @@ def _search_kernel(dtype: torch.dtype) -> wp.Kernel:
             bound = wp.min(bound, along * along + wp.dot(out, out) - out[a] * out[a])
         return bound
 
+    @wp.func
+    def apart(q: real, i: wp.int32, width: real):
+        """Squared distance from a coordinate to an interval of cells, less a hundredth of a cell for round-off."""
+        low = width * (real(i) - real(0.01)) - q
+        outside = wp.max(wp.max(low, -low - real(1.02) * width), real(0.0))
+        return outside * outside
+
     @wp.kernel(enable_backward=False, module=module)
     def search(
         points: wp.array(dtype=vec3),  # sorted by cell
@@ -67,17 +74,21 @@ def _search_kernel(dtype: torch.dtype) -> wp.Kernel:
         best, closest = real(wp.inf), wp.int32(-1)
         for ring in range(wp.max(n[0], wp.max(n[1], n[2]))):
             for i in range(wp.max(c[0] - ring, 0), wp.min(c[0] + ring + 1, n[0])):
+                across = apart(q[0], i, w)
+                if across > best:
+                    continue
                 for j in range(wp.max(c[1] - ring, 0), wp.min(c[1] + ring + 1, n[1])):
+                    to_row, row = across + apart(q[1], j, w), first[s] + (i * n[1] + j) * n[2]
                     side = wp.abs(i - c[0]) == ring or wp.abs(j - c[1]) == ring
                     stride = wp.where(side or ring == 0, 1, 2 * ring)
-                    for m in range(c[2] - ring, c[2] + ring + 1, stride):
-                        if m >= 0 and m < n[2]:
-                            cell = first[s] + (i * n[1] + j) * n[2] + m
-                            for p in range(starts[cell], starts[cell + 1]):
-                                offset = points[p] - queries[k]
-                                distance = wp.dot(offset, offset)
-                                if distance < best:
-                                    best, closest = distance, p
+                    if to_row <= best and starts[row] < starts[row + n[2]]:
+                        for m in range(c[2] - ring, c[2] + ring + 1, stride):
+                            if m >= 0 and m < n[2] and to_row + apart(q[2], m, w) <= best:
+                                for p in range(starts[row + m], starts[row + m + 1]):
+                                    offset = points[p] - queries[k]
+                                    distance = wp.dot(offset, offset)
+                                    if distance < best:
+                                        best, closest = distance, p
             if best <= beyond(q, c, n, w, ring):
                 break
         out[k] = closest

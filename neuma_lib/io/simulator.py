@@ -9,8 +9,6 @@ import numpy as np
 
 from neuma_lib.config.obstacles import is_mesh_file
 from neuma_lib.errors import InputError
-from neuma_lib.geometry.mesh_collider import mesh_collider
-from neuma_lib.io.mesh_files import read_any_mesh
 from neuma_lib.sim.clamps import Clamp
 from neuma_lib.sim.colliders import Collider
 from neuma_lib.sim.model import MPM
@@ -43,6 +41,10 @@ def with_obstacles(constants: Mapping[str, Any]) -> dict[str, Any]:
 def _collider(settings: Mapping[str, Any]) -> Collider:
     if not is_mesh_file(settings["shape"]):
         return Collider(**settings)
+    # Here, because they import trimesh, which takes longer than many a job.
+    from neuma_lib.geometry.mesh_collider import mesh_collider
+    from neuma_lib.io.mesh_files import read_any_mesh
+
     mesh = read_any_mesh(settings["shape"])
     mesh.merge_vertices()  # some formats store the corners of each triangle
     (longest,) = settings["size"]

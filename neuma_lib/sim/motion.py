@@ -10,7 +10,6 @@ from itertools import pairwise
 from typing import NamedTuple, Self
 
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from neuma_lib.errors import InputError
@@ -147,11 +146,15 @@ class _Piece(NamedTuple):
 
 def turned(rotation: Tensor) -> Tensor:
     """Rotation matrix (3, 3) of a rotation vector (3,) [rad]."""
+    from scipy.spatial.transform import Rotation  # here, because the import takes a quarter of a second
+
     return torch.from_numpy(Rotation.from_rotvec(rotation.numpy()).as_matrix())
 
 
 def rotation_vector(matrix: Tensor) -> Tensor:
     """Rotation vector (3,) [rad], of at most pi, of a rotation matrix (3, 3)."""
+    from scipy.spatial.transform import Rotation
+
     return torch.from_numpy(Rotation.from_matrix(matrix.numpy()).as_rotvec())
 
 

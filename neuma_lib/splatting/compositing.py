@@ -1,15 +1,12 @@
-"""Interface of the compositors. A compositor is a module with two functions over the splats of I images:
+"""Interface of the compositors. A compositor is a module with four functions over the splats of I images:
 
 ``composite(splats, depths, background, settings, empty)``
     returns the images (I, H, W, 3), the alphas (I, H, W) and a tuple of tensors for the adjoint;
 ``composite_adjoint(splats, kept, background, settings, grad_pictures, grad_alphas, grad_splats, empty)``
-    writes the gradients (I, G, SPLAT_SIZE) of all splats that are not culled; those of the others are undefined.
-
-A compositor that compares images with an observation without storing them has two more:
-
+    writes the gradients (I, G, SPLAT_SIZE) of all splats that are not culled; those of the others are undefined;
 ``compare(splats, depths, background, settings, observed, empty)``
-    takes straight-alpha RGBA (I, H, W) as int32, R in the lowest byte, and returns sums of squared differences from it
-    over white, float64 (I, parts) with any number of parts, and a tuple of tensors for the adjoint;
+    stores no images, takes straight-alpha RGBA (I, H, W) as int32, R in the lowest byte, and returns sums of squared
+    differences from it over white, float64 (I, parts) with any number of parts, and a tuple of tensors for the adjoint;
 ``compare_adjoint(splats, kept, background, settings, scales, opacities, grad_splats)``
     writes, like ``composite_adjoint``, the gradients of half of these sums, times the scale (I,) of each image; those
     with respect to the opacities are undefined unless ``opacities`` is true.
@@ -20,10 +17,6 @@ A compositor that compares images with an observation without storing them has t
 from __future__ import annotations
 
 import dataclasses
-
-import torch
-
-from neuma_lib.splatting.projection import CULLED
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,8 +29,3 @@ class Settings:
     alpha_max: float
     transmittance_min: float
     eps2d: float
-
-
-def depth_order(depths: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Splats of every image from near to far (I, G), and the number of splats that are not culled (I,)."""
-    return torch.argsort(depths, dim=1, stable=True), (depths < CULLED).sum(dim=1)

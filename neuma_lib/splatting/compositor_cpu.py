@@ -1,41 +1,42 @@
-"""Splat-major compositing on a CPU: splats in depth order, each over the exact rows and columns that it covers.
+"""Splat-major compositing on a CPU: splats in depth order, each over the tiles that its ellipse reaches.
 
-On one core, a loop over splats and their pixels is faster than the pixel-major order of a GPU, because it needs no tile
-lists and all loads are contiguous. Pixels store colour, transmittance T and the rank at which they became opaque. The
-reverse pass visits the splats backwards and recovers the previous transmittance by dividing by 1 - alpha.
-
-Rows are processed eight pixels at a time with the vector types of Clang, which Warp embeds on every platform, so these
-kernels are native snippets. Planes have padded rows (``padded_width``). Values of lanes right of the image are unused,
-and their image gradient is zero.
+A tile of 4x4 pixels is one vector of Clang, which Warp embeds on every platform, so these kernels are native snippets.
+On one core, a loop over splats and their tiles needs no lists, and parameters and sums of a splat stay in registers.
+Tiles store transmittance, colours and the rank at which each pixel became opaque; splats skip tiles without open
+pixels. The reverse pass visits the splats backwards and recovers the previous transmittance by dividing by 1 - alpha.
+Images are processed one after the other and share memory for sorting and for the reverse pass, which stays in the
+cache.
 """
 
 import functools
+from types import SimpleNamespace
 
 import torch
 import warp as wp
 
 from neuma_lib.device import launch, native_source, start_warp
-from neuma_lib.splatting.compositing import Settings, depth_order
+from neuma_lib.splatting.compositing import Settings
+from neuma_lib.splatting.projection import CULLED
 from neuma_lib.splatting.records import SPLAT_SIZE
 
 start_warp()
 
-LANES = 8
-FORWARD_PLANES = 5  # transmittance, red, green, blue, rank of the first splat that was not drawn
-BACKWARD_PLANES = 5  # transmittance, gradients of red, green, blue, gradient-weighted light from behind
+TILE = 4
+LISTED = 4200
+"""More than the tiles that are listed before the last splat of a list. Keeps the list in the fastest cache."""
+PLANES = 5
+"""Numbers per pixel: see ``compositor_cpu.cpp``; in the reverse pass transmittance, gradients of red, green and blue,
+and gradient-weighted light from behind."""
 
 
 def composite(splats, depths, background, settings: Settings, empty):
     """See ``compositing``."""
-    shape = (*depths.shape[:1], settings.height, settings.width)
+    shape = (len(depths), settings.height, settings.width)
     pictures, alphas = empty("pictures", (*shape, 3), splats), empty("alphas", shape, splats)
-    planes = (shape[0], FORWARD_PLANES, settings.height, padded_width(settings.width))
-    kept = (*depth_order(depths), empty("planes", planes, splats))
-    order, seen, planes = kept
-    kernel, _ = kernels(splats.dtype)
+    kept = _kept(splats, settings, empty)
     launch(
-        kernel, shape[0], splats, order, seen, settings.alpha_min, settings.alpha_max, settings.transmittance_min,
-        background, planes, pictures, alphas,
+        kernels(splats.dtype).draw, len(depths), splats, depths, *_thresholds(settings), settings.transmittance_min,
+        background, *_spare(kept), *kept, pictures, alphas,
     )  # fmt: skip
     return pictures, alphas, kept
 
@@ -44,97 +45,239 @@ def composite_adjoint(
     splats, kept, background, settings: Settings, grad_pictures, grad_alphas, grad_splats, empty
 ):
     """See ``compositing``."""
-    order, seen, planes = kept
-    scratch = empty("scratch", (len(planes), BACKWARD_PLANES, *planes.shape[2:]), splats)
-    _, kernel = kernels(splats.dtype)
     launch(
-        kernel, len(planes), splats, order, seen, settings.alpha_min, settings.alpha_max, background, planes,
-        grad_pictures, grad_alphas, scratch, grad_splats,
+        kernels(splats.dtype).draw_adjoint, len(splats), splats, *_thresholds(settings), background, *kept,
+        grad_pictures, grad_alphas, *_spare(kept), torch.empty_like(kept[-1][0]), grad_splats,
     )  # fmt: skip
 
 
-def padded_width(width: int) -> int:
-    """Row length of the planes, such that a splat that starts at the last column fills all lanes."""
-    return width + LANES
+def compare(splats, depths, background, settings: Settings, observed, empty):
+    """See ``compositing``."""
+    kept = _kept(splats, settings, empty)
+    sums = empty("sums", (len(depths),), splats, torch.float64)
+    launch(
+        kernels(splats.dtype).compare, len(depths), splats, depths, *_thresholds(settings), settings.transmittance_min,
+        background, *_spare(kept), *kept, observed, sums,
+    )  # fmt: skip
+    return sums[:, None], kept
 
 
-def source(name: str, dtype: torch.dtype) -> str:
-    """C++ text of a pass, "forward" or "backward"."""
-    parts = native_source(__file__, ".cpp")
-    exponential = parts["exp_" + str(dtype).removeprefix("torch.")]
-    loops = parts["splat"].replace("BODY\n", parts[f"{name}_body"] + "\n")
-    text = parts["types"] + exponential + parts[name].replace("SPLAT\n", loops + "\n")
+def compare_adjoint(splats, kept, background, settings: Settings, scales, opacities: bool, grad_splats):
+    """See ``compositing``."""
+    launch(
+        kernels(splats.dtype).compare_adjoint, len(splats), splats, *_thresholds(settings), background, *kept,
+        settings.width, settings.height, scales, opacities, *_spare(kept), torch.empty_like(kept[-1][0]), grad_splats,
+    )  # fmt: skip
+
+
+def _kept(splats, settings: Settings, empty) -> tuple[torch.Tensor, ...]:
+    """Memory for the splats by rank (I, G), their numbers (I,), and the first hidden rank and planes of each tile."""
+    tiles = -(-settings.width // TILE) * -(-settings.height // TILE)
+    order, numbers, ends = (
+        empty(name, (len(splats), *size), splats, torch.int32)
+        for name, size in (("order", splats.shape[1:2]), ("numbers", ()), ("ends", (tiles,)))
+    )
+    return order, numbers, ends, empty("planes", (len(splats), tiles, PLANES, TILE**2), splats)
+
+
+def _spare(kept) -> tuple[torch.Tensor, torch.Tensor]:
+    """Memory to sort the splats of one image and to list their tiles, and for the corners of these."""
+    order, _, ends, planes = kept
+    listed = LISTED + ends.shape[1]
+    return order.new_empty(max(order.shape[1], listed)), planes.new_empty(2, listed)
+
+
+def _thresholds(settings: Settings) -> tuple[float, float]:
+    return settings.alpha_min, settings.alpha_max
+
+
+def source(dtype: torch.dtype, *names: str, **parts: str) -> str:
+    """C++ text of a function from parts of ``compositor_cpu.cpp``, in which names of other parts are replaced."""
+    texts = native_source(__file__, ".cpp")
+    text = "".join(texts[name] for name in ("types", "exp2_" + str(dtype).removeprefix("torch."), *names))
+    for name, part in parts.items():
+        text = text.replace(f"{name}\n", texts[part] + "\n" if part else "\n")
     real = {torch.float32: "float", torch.float64: "double"}[dtype]
-    for constant, value in {"SPLAT_SIZE": SPLAT_SIZE, "LANES": LANES, "REAL": real}.items():
+    for constant, value in {"SPLAT_SIZE": SPLAT_SIZE, "CULLED": CULLED, "REAL": real}.items():
         text = text.replace(constant, str(value))
     return text
 
 
 @functools.cache
 def kernels(dtype: torch.dtype):
-    """``(composite, composite_adjoint)`` Warp kernels of a dtype; one thread per image, CPU only."""
+    """Kernels ``draw``, ``draw_adjoint``, ``compare``, ``compare_adjoint`` of a dtype, CPU only. A thread processes an
+    image; Warp runs them one after the other."""
     real = wp.dtype_from_torch(dtype)
     module = wp.get_module(f"{__name__}.{str(dtype).removeprefix('torch.')}")
 
-    @wp.func_native(source("forward", dtype))
-    def composite_image(
-        image: int, count: int, seen: int, height: int, width: int, pitch: int,
-        splats: wp.array3d(dtype=real), order: wp.array2d(dtype=wp.int64),
-        alpha_min: real, alpha_max: real, transmittance_min: real,
-        back0: real, back1: real, back2: real,
-        planes: wp.array4d(dtype=real), pictures: wp.array4d(dtype=real), alphas: wp.array3d(dtype=real),
+    @wp.func_native(
+        source(
+            dtype, "rank", "forward", "draw", SPLATS_LOOP="splats", START="", BODY="forward_body", FINISH=""
+        )
+    )
+    def draw_image(
+        image: int, count: int, height: int, width: int,
+        splats: wp.array3d(dtype=real), depths: wp.array2d(dtype=real),
+        alpha_min: real, alpha_max: real, transmittance_min: real, back0: real, back1: real, back2: real,
+        spare: wp.array(dtype=int), corners: wp.array2d(dtype=real), order: wp.array2d(dtype=int),
+        numbers: wp.array(dtype=int), ends: wp.array2d(dtype=int), planes: wp.array4d(dtype=real),
+        pictures: wp.array4d(dtype=real), alphas: wp.array3d(dtype=real),
     ): ...  # fmt: skip
 
-    @wp.func_native(source("backward", dtype))
-    def composite_image_adjoint(
-        image: int, count: int, seen: int, height: int, width: int, pitch: int,
-        splats: wp.array3d(dtype=real), order: wp.array2d(dtype=wp.int64),
-        alpha_min: real, alpha_max: real,
-        back0: real, back1: real, back2: real,
-        planes: wp.array4d(dtype=real),
+    @wp.func_native(
+        source(
+            dtype,
+            "rank",
+            "forward",
+            "compare",
+            SPLATS_LOOP="splats",
+            START="",
+            BODY="forward_body",
+            FINISH="",
+        )
+    )
+    def compare_image(
+        image: int, count: int, height: int, width: int,
+        splats: wp.array3d(dtype=real), depths: wp.array2d(dtype=real),
+        alpha_min: real, alpha_max: real, transmittance_min: real, back0: real, back1: real, back2: real,
+        spare: wp.array(dtype=int), corners: wp.array2d(dtype=real), order: wp.array2d(dtype=int),
+        numbers: wp.array(dtype=int), ends: wp.array2d(dtype=int), planes: wp.array4d(dtype=real),
+        observed: wp.array3d(dtype=int), sums: wp.array(dtype=wp.float64),
+    ): ...  # fmt: skip
+
+    @wp.func_native(
+        source(
+            dtype,
+            "backward",
+            GRADIENTS="image_gradients",
+            SPLATS_LOOP="splats",
+            START="sums",
+            BODY="backward_body",
+            FINISH="gradients",
+        )
+    )
+    def draw_image_adjoint(
+        image: int, count: int, height: int, width: int,
+        splats: wp.array3d(dtype=real), alpha_min: real, alpha_max: real, back0: real, back1: real, back2: real,
+        order: wp.array2d(dtype=int), numbers: wp.array(dtype=int), ends: wp.array2d(dtype=int),
+        planes: wp.array4d(dtype=real), opacities: bool, spare: wp.array(dtype=int),
+        corners: wp.array2d(dtype=real), scratch: wp.array3d(dtype=real), grad_splats: wp.array3d(dtype=real),
         grad_pictures: wp.array4d(dtype=real), grad_alphas: wp.array3d(dtype=real),
-        scratch: wp.array4d(dtype=real), grad_splats: wp.array3d(dtype=real),
+    ): ...  # fmt: skip
+
+    @wp.func_native(
+        source(
+            dtype,
+            "backward",
+            GRADIENTS="error_gradients",
+            SPLATS_LOOP="splats",
+            START="sums",
+            BODY="backward_body",
+            FINISH="gradients",
+        )
+    )
+    def compare_image_adjoint(
+        image: int, count: int, height: int, width: int,
+        splats: wp.array3d(dtype=real), alpha_min: real, alpha_max: real, back0: real, back1: real, back2: real,
+        order: wp.array2d(dtype=int), numbers: wp.array(dtype=int), ends: wp.array2d(dtype=int),
+        planes: wp.array4d(dtype=real), opacities: bool, spare: wp.array(dtype=int),
+        corners: wp.array2d(dtype=real), scratch: wp.array3d(dtype=real), grad_splats: wp.array3d(dtype=real),
+        scales: wp.array(dtype=real),
     ): ...  # fmt: skip
 
     @wp.kernel(module=module, enable_backward=False)
-    def composite(
+    def draw(
         splats: wp.array3d(dtype=real),  # (I, G, SPLAT_SIZE)
-        order: wp.array2d(dtype=wp.int64),  # (I, G) indices by depth
-        seen: wp.array(dtype=wp.int64),  # (I,) number of splats that are not culled
+        depths: wp.array2d(dtype=real),  # (I, G)
         alpha_min: real,
         alpha_max: real,
         transmittance_min: real,
         background: wp.array(dtype=real),  # (3,)
-        planes: wp.array4d(dtype=real),  # (I, FORWARD_PLANES, H, padded W), out
+        spare: wp.array(dtype=int),
+        corners: wp.array2d(dtype=real),
+        order: wp.array2d(dtype=int),  # (I, G), out: the splats that are not culled by depth
+        numbers: wp.array(dtype=int),  # (I,), out: their number
+        ends: wp.array2d(dtype=int),  # (I, tiles), out
+        planes: wp.array4d(dtype=real),  # (I, tiles, PLANES, TILE^2), out
         pictures: wp.array4d(dtype=real),  # (I, H, W, 3), out
         alphas: wp.array3d(dtype=real),  # (I, H, W), out
     ):
-        i = wp.tid()
-        composite_image(
-            i, splats.shape[1], int(seen[i]), alphas.shape[1], alphas.shape[2], planes.shape[3],
-            splats, order, alpha_min, alpha_max, transmittance_min,
-            background[0], background[1], background[2], planes, pictures, alphas,
+        draw_image(
+            wp.tid(), splats.shape[1], alphas.shape[1], alphas.shape[2], splats, depths, alpha_min, alpha_max,
+            transmittance_min, background[0], background[1], background[2], spare, corners, order, numbers, ends,
+            planes, pictures, alphas,
         )  # fmt: skip
 
     @wp.kernel(module=module, enable_backward=False)
-    def composite_adjoint(
+    def compare(
         splats: wp.array3d(dtype=real),  # (I, G, SPLAT_SIZE)
-        order: wp.array2d(dtype=wp.int64),  # (I, G)
-        seen: wp.array(dtype=wp.int64),  # (I,)
+        depths: wp.array2d(dtype=real),  # (I, G)
+        alpha_min: real,
+        alpha_max: real,
+        transmittance_min: real,
+        background: wp.array(dtype=real),  # (3,)
+        spare: wp.array(dtype=int),
+        corners: wp.array2d(dtype=real),
+        order: wp.array2d(dtype=int),  # (I, G), out
+        numbers: wp.array(dtype=int),  # (I,), out
+        ends: wp.array2d(dtype=int),  # (I, tiles), out
+        planes: wp.array4d(dtype=real),  # (I, tiles, PLANES, TILE^2), out: differences instead of colours
+        observed: wp.array3d(dtype=int),  # (I, H, W)
+        sums: wp.array(dtype=wp.float64),  # (I,), out
+    ):
+        compare_image(
+            wp.tid(), splats.shape[1], observed.shape[1], observed.shape[2], splats, depths, alpha_min, alpha_max,
+            transmittance_min, background[0], background[1], background[2], spare, corners, order, numbers, ends,
+            planes, observed, sums,
+        )  # fmt: skip
+
+    @wp.kernel(module=module, enable_backward=False)
+    def draw_adjoint(
+        splats: wp.array3d(dtype=real),  # (I, G, SPLAT_SIZE)
         alpha_min: real,
         alpha_max: real,
         background: wp.array(dtype=real),  # (3,)
-        planes: wp.array4d(dtype=real),  # (I, FORWARD_PLANES, H, padded W)
+        order: wp.array2d(dtype=int),  # (I, G)
+        numbers: wp.array(dtype=int),  # (I,)
+        ends: wp.array2d(dtype=int),  # (I, tiles)
+        planes: wp.array4d(dtype=real),  # (I, tiles, PLANES, TILE^2)
         grad_pictures: wp.array4d(dtype=real),  # (I, H, W, 3)
         grad_alphas: wp.array3d(dtype=real),  # (I, H, W)
-        scratch: wp.array4d(dtype=real),  # (I, BACKWARD_PLANES, H, padded W)
+        spare: wp.array(dtype=int),
+        corners: wp.array2d(dtype=real),
+        scratch: wp.array3d(dtype=real),  # (tiles, PLANES, TILE^2)
         grad_splats: wp.array3d(dtype=real),  # (I, G, SPLAT_SIZE), out
     ):
-        i = wp.tid()
-        composite_image_adjoint(
-            i, splats.shape[1], int(seen[i]), grad_alphas.shape[1], grad_alphas.shape[2],
-            planes.shape[3], splats, order, alpha_min, alpha_max, background[0], background[1], background[2],
-            planes, grad_pictures, grad_alphas, scratch, grad_splats,
+        draw_image_adjoint(
+            wp.tid(), splats.shape[1], grad_alphas.shape[1], grad_alphas.shape[2], splats, alpha_min, alpha_max,
+            background[0], background[1], background[2], order, numbers, ends, planes, True, spare, corners,
+            scratch, grad_splats, grad_pictures, grad_alphas,
         )  # fmt: skip
 
-    return composite, composite_adjoint
+    @wp.kernel(module=module, enable_backward=False)
+    def compare_adjoint(
+        splats: wp.array3d(dtype=real),  # (I, G, SPLAT_SIZE)
+        alpha_min: real,
+        alpha_max: real,
+        background: wp.array(dtype=real),  # (3,)
+        order: wp.array2d(dtype=int),  # (I, G)
+        numbers: wp.array(dtype=int),  # (I,)
+        ends: wp.array2d(dtype=int),  # (I, tiles)
+        planes: wp.array4d(dtype=real),  # (I, tiles, PLANES, TILE^2), result of `compare`
+        width: int,
+        height: int,
+        scales: wp.array(dtype=real),  # (I,)
+        opacities: bool,
+        spare: wp.array(dtype=int),
+        corners: wp.array2d(dtype=real),
+        scratch: wp.array3d(dtype=real),  # (tiles, PLANES, TILE^2)
+        grad_splats: wp.array3d(dtype=real),  # (I, G, SPLAT_SIZE), out
+    ):
+        compare_image_adjoint(
+            wp.tid(), splats.shape[1], height, width, splats, alpha_min, alpha_max, background[0], background[1],
+            background[2], order, numbers, ends, planes, opacities, spare, corners, scratch, grad_splats, scales,
+        )  # fmt: skip
+
+    return SimpleNamespace(
+        draw=draw, draw_adjoint=draw_adjoint, compare=compare, compare_adjoint=compare_adjoint
+    )

@@ -2,7 +2,7 @@
 
 One autograd function contains projection and compositing, Warp kernels with hand-written adjoints. CPUs composite splat
 by splat (``compositor_cpu``), GPUs tile by tile (``compositor_cuda``). ``gsplat_backend`` uses the gsplat package
-instead. If only the squared error is needed, a compositor may compare with the observation directly
+instead. If only the squared error is needed, the compositor compares with the observation directly
 (``rasterized_error``).
 """
 
@@ -283,8 +283,8 @@ def rasterized_error(
 ) -> torch.Tensor:
     """Mean squared difference of each rendered frame from the observation (paper Eq. 2).
 
-    Equals ``mean_squared_error(rasterize(...)[0], observed)`` and has the same gradients. For observations as uint8 on
-    CUDA in float32, the compositor computes it without storing images, with sums in another order.
+    Equals ``mean_squared_error(rasterize(...)[0], observed)`` and has the same gradients. For observations as uint8,
+    the compositor computes it without storing images, with sums in another order (on CUDA in float32 only).
 
     Args:
         observed: see `mean_squared_error`.
@@ -302,8 +302,7 @@ def rasterized_error(
         alpha_min=alpha_min, alpha_max=alpha_max, transmittance_min=transmittance_min, eps2d=eps2d
     )
     compositor = COMPOSITORS[_own_compositor(means)]
-    can_compare = hasattr(compositor, "compare") and means.dtype == torch.float32
-    if not can_compare or observed.dtype != torch.uint8:
+    if observed.dtype != torch.uint8 or (means.is_cuda and means.dtype != torch.float32):
         images, _ = rasterize(*scene, width, height, background=background, **thresholds)
         return mean_squared_error(images, observed)
     check_shapes(*scene)

@@ -86,7 +86,7 @@ def test_observed_images_on_another_device_are_refused():
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("decoded", [True, False])
 def test_error_of_a_render_is_that_of_its_images(dtype, decoded):
-    """On a CPU to the last bit; `test_splat_tiles.py` has the twin of what a GPU does."""
+    """On a CPU up to the order of sums; `test_splat_tiles.py` has the twin of what a GPU does."""
     scene = random_scene(3, 60, 2, 26, 21, 4, scale=0.05, dtype=dtype)
     observed = random_pixels(3, 2, 21, 26)
     if not decoded:
@@ -102,7 +102,8 @@ def test_error_of_a_render_is_that_of_its_images(dtype, decoded):
             losses = mean_squared_error(images, observed)
         weight = torch.tensor([0.5, 0.0, 3.0], dtype=dtype)
         actual.append([losses.detach(), *torch.autograd.grad(losses, inputs, weight)])
-    assert all(torch.equal(a, b) for a, b in zip(*actual, strict=True))
+    bound = 20 * torch.finfo(dtype).eps
+    assert all((a - b).norm() <= bound * a.norm() for a, b in zip(*actual, strict=True))
 
 
 @pytest.mark.parametrize("index", range(4), ids=["means", "covars", "opacities", "sh"])
@@ -138,9 +139,8 @@ def test_error_of_an_exposure_is_that_of_its_mean():
     expected = mean_squared_error(renderer(x, F).mean(0)[None], video.images)
     assert_near(filmed.error(*states, video.stored()), expected, torch.float64)
     at_once = Filmed(renderer, Observation((0,), video.images, camera()), (0,))
-    assert torch.equal(
-        at_once.error(x[:1], F[:1], video.stored()), mean_squared_error(renderer(x[:1], F[:1]), video.images)
-    )
+    expected = mean_squared_error(renderer(x[:1], F[:1]), video.images)
+    assert_near(at_once.error(x[:1], F[:1], video.stored()), expected, torch.float64)
     masks = Filmed(renderer, video, (0, 1, 2), "masks")
     expected = mean_squared_error(renderer.coverage(x, F).mean(0)[None], video.coverage())
     assert_near(masks.error(*states, video.coverage()), expected, torch.float64)

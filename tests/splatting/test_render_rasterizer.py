@@ -53,6 +53,11 @@ def test_equals_twin_close_to_the_camera():
     assert_equals_twin(scene)
 
 
+def test_equals_twin_with_many_splats():
+    # more than a CPU lists at a time, by number and by tiles
+    assert_equals_twin(random_scene(1, 600, 1, WIDTH, HEIGHT, 1, scale=0.03), **LOOSE)
+
+
 def test_float32_agrees_with_float64():
     scene = random_scene(2, 600, 2, 64, 64, 9, scale=0.02)
     precise = rasterize(*scene, 64, 64)[0]
