@@ -80,7 +80,7 @@
 //// block
     // Weights of up to 16 particles, one per lane. Loops over the particles read them as scalars from memory, which costs
     // less than to move them between lanes.
-    typedef int Indices __attribute__((vector_size(16 * sizeof(int))));
+    typedef int Indices __attribute__((vector_size(16 * sizeof(int)), aligned(sizeof(int))));
     struct Block {
         Real f[3][16];  // distance from the first node [dx]
         Real w[3][3][16], wd[3][3][16], slope[3][3][16];  // by axis and node: weights, moments and slopes
@@ -114,8 +114,9 @@
             for (int j = 0; j < 3; ++j)
                 *(Row*)block.w_ij[3 * i + j] = *(const Row*)block.w[0][i] * *(const Row*)block.w[1][j];
         const Indices line = base[0] * n + base[1];
-        for (int l = 0; l < 16; ++l) block.line[l] = line[l], block.k[l] = base[2][l];
-        for (int l = 0; l < 16; ++l) block.first[l] = (copy * n * n + block.line[l]) * n + block.k[l];
+        *(Indices*)block.line = line;
+        *(Indices*)block.k = base[2];
+        *(Indices*)block.first = (copy * n * n + line) * n + base[2];
     };
     // Four numbers of an axis spread over the lanes of a row
     auto spread = [&](const Real (*w)[16], int l) INLINE {
