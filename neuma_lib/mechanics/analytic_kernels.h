@@ -159,7 +159,7 @@
                 const Pack product = X[i] * X[j];
                 Pack value, slope;
                 sinhc(half * (e[i] - e[j]), DIVIDE(X[i], X[j]), value, slope);
-                quotient[k] = Real(2) * half * (c[1] * product + (ogden ? zero : DIVIDE(back, product))) * value;
+                quotient[k] = Real(2) * half * (c[1] * product + (ogden ? zero : DIVIDE(zero + back, product))) * value;
             }
             const Pack weighted[3] = {h[0] * x[0], h[1] * x[1], h[2] * x[2]};
             grad_c[0] = weighted[0] + weighted[1] + weighted[2];
@@ -572,14 +572,10 @@
 // processes one row.
 //// rows
     auto load = [&](uint64_t array, size_t first, int used, Pack* x) {
-        const Real* const p = (const Real*)array + 9 * first;
-        for (int l = 0; l < WIDTH; ++l)
-            for (int k = 0; k < 9; ++k) LANE(x[k], l) = p[9 * (l < used ? l : 0) + k];
+        Matrices::load((const Real*)array + 9 * first, used, x);
     };
     auto store = [&](uint64_t array, size_t first, int used, const Pack* x) {
-        Real* const p = (Real*)array + 9 * first;
-        for (int l = 0; l < used; ++l)
-            for (int k = 0; k < 9; ++k) p[9 * l + k] = LANE(x[k], l);
+        Matrices::store((Real*)array + 9 * first, used, x);
     };
     auto add_up = [&](uint64_t partials, size_t pack, int used, const Pack* grad_c) {
         if (!partials) return;

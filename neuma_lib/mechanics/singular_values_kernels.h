@@ -18,8 +18,8 @@
     // Through memory, because inserting numbers into a pack of several registers is several times slower. A set lane
     // of a mask is not a number, so that it converts to true.
     #define LANE(x, l) ((Real*)&(x))[l]
-    // In single precision from an estimate by Newton's method, with an error of two units in the last place for normal
-    // numbers: in a third of the time of quotients and roots, for which a processor has a single unit.
+    // In single precision from an estimate by Newton's method, with an error of one or two units in the last place for
+    // normal numbers: in a third of the time of quotients and roots, for which a processor has a single unit.
     struct Newton {
         typedef decltype(Pack{} < Pack{}) Bits;  // as wide as Real
         typedef float Register __attribute__((vector_size(64)));
@@ -50,15 +50,93 @@
         }
         static __attribute__((always_inline)) Pack root(const Pack& x) {
             if (sizeof(Real) == 8) return __builtin_elementwise_sqrt(x);
-            const Real least = Real(1.17549435e-38);
-            return x * reciprocal_root(x > least ? x : Pack{} + least);
+            const Real least = Real(2.35e-38);
+            const Pack r = reciprocal_root(x > least ? x : Pack{} + least), y = x * r;
+            return y + Real(0.5) * r * (x - y * y);
+        }
+        static __attribute__((always_inline)) Pack quotient(const Pack& x, const Pack& y) {
+            if (sizeof(Real) == 8) return x / y;
+            const Pack r = reciprocal(y), q = x * r;
+            return q + r * (x - q * y);
         }
     };
     #define SQRT(x) Newton::root(x)
     #define RECIPROCAL(x) Newton::reciprocal(x)
     #define RECIPROCAL_ROOT(x) Newton::reciprocal_root(x)
-    #define DIVIDE(x, y) ((x) * Newton::reciprocal(y))
+    #define DIVIDE(x, y) Newton::quotient(x, y)
 #endif
+
+// Row-major 3x3 matrices of consecutive particles. Lanes after the last one, `used`, receive the first, or zeros.
+//// matrices
+    struct Matrices {
+#if !defined(__CUDA_ARCH__)
+        typedef Real Four __attribute__((vector_size(4 * sizeof(Real)), aligned(sizeof(Real))));
+        typedef Real Eight __attribute__((vector_size(8 * sizeof(Real))));
+        typedef Real Sixteen __attribute__((vector_size(16 * sizeof(Real))));
+        // Transposes 4 x 4 numbers of four particles in each quarter of the lanes.
+        static __attribute__((always_inline)) void transpose(Sixteen* r) {
+            #define PAIRS(a, b, i) __builtin_shufflevector(a, b, i, i + 16, i + 1, i + 17, i + 4, i + 20, i + 5, i + 21, \
+                i + 8, i + 24, i + 9, i + 25, i + 12, i + 28, i + 13, i + 29)
+            #define HALVES(a, b, i) __builtin_shufflevector(a, b, i, i + 1, i + 16, i + 17, i + 4, i + 5, i + 20, i + 21, \
+                i + 8, i + 9, i + 24, i + 25, i + 12, i + 13, i + 28, i + 29)
+            const Sixteen a = PAIRS(r[0], r[1], 0), b = PAIRS(r[2], r[3], 0);
+            const Sixteen c = PAIRS(r[0], r[1], 2), d = PAIRS(r[2], r[3], 2);
+            r[0] = HALVES(a, b, 0);
+            r[1] = HALVES(a, b, 2);
+            r[2] = HALVES(c, d, 0);
+            r[3] = HALVES(c, d, 2);
+            #undef PAIRS
+            #undef HALVES
+        }
+#endif
+        static void load(const Real* p, int used, Pack* x, bool repeats = true) {
+#if !defined(__CUDA_ARCH__)
+            if (used == WIDTH && WIDTH % 16 == 0) {
+                for (int part = 0; part < WIDTH / 16; ++part, p += 9 * 16) {
+                    for (int k = 0; k < 8; k += 4) {
+                        Sixteen r[4];
+                        for (int j = 0; j < 4; ++j) {
+                            const Real* const q = p + 9 * j + k;
+                            const Eight low = __builtin_shufflevector(*(const Four*)q, *(const Four*)(q + 36), 0, 1, 2, 3, 4, 5, 6, 7);
+                            const Eight high = __builtin_shufflevector(*(const Four*)(q + 72), *(const Four*)(q + 108), 0, 1, 2, 3, 4, 5, 6, 7);
+                            r[j] = __builtin_shufflevector(low, high, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+                        }
+                        transpose(r);
+                        for (int j = 0; j < 4; ++j) ((Sixteen*)&x[k + j])[part] = r[j];
+                    }
+                    for (int l = 0; l < 16; ++l) LANE(x[8], 16 * part + l) = p[9 * l + 8];
+                }
+                return;
+            }
+#endif
+            for (int l = 0; l < WIDTH; ++l)
+                for (int k = 0; k < 9; ++k) LANE(x[k], l) = l < used || repeats ? p[9 * (l < used ? l : 0) + k] : Real(0);
+        }
+        static void store(Real* p, int used, const Pack* x) {
+#if !defined(__CUDA_ARCH__)
+            if (used == WIDTH && WIDTH % 16 == 0) {
+                for (int part = 0; part < WIDTH / 16; ++part, p += 9 * 16) {
+                    for (int k = 0; k < 8; k += 4) {
+                        Sixteen r[4];
+                        for (int j = 0; j < 4; ++j) r[j] = ((const Sixteen*)&x[k + j])[part];
+                        transpose(r);
+                        for (int j = 0; j < 4; ++j) {
+                            Real* const q = p + 9 * j + k;
+                            *(Four*)q = __builtin_shufflevector(r[j], r[j], 0, 1, 2, 3);
+                            *(Four*)(q + 36) = __builtin_shufflevector(r[j], r[j], 4, 5, 6, 7);
+                            *(Four*)(q + 72) = __builtin_shufflevector(r[j], r[j], 8, 9, 10, 11);
+                            *(Four*)(q + 108) = __builtin_shufflevector(r[j], r[j], 12, 13, 14, 15);
+                        }
+                    }
+                    for (int l = 0; l < 16; ++l) p[9 * l + 8] = LANE(x[8], 16 * part + l);
+                }
+                return;
+            }
+#endif
+            for (int l = 0; l < used; ++l)
+                for (int k = 0; k < 9; ++k) p[9 * l + k] = LANE(x[k], l);
+        }
+    };
 
 // First in a function: enables fused multiply-add on a CPU, as on a GPU, which is not Warp's default. Numbers below the
 // normal ones, such as squares of a vanishing angle, become zero, because they are a hundred times slower on x86.
@@ -183,16 +261,14 @@
 
 //// load
     Pack a[9];
-    for (int l = 0; l < WIDTH; ++l) {
-        const Real* p = (const Real*)F.data + 9 * (first + (l < used ? l : 0));
-        for (int k = 0; k < 9; ++k) LANE(a[k], l) = p[k];
-    }
+    Matrices::load((const Real*)F.data + 9 * first, used, a);
 
 // Decomposes `Pack a[9]` (row-major, scaled in place) into columns u0, u1, u2 and v0, v1, v2 and s[3]. Cyclic Jacobi on
 // A^T A gives V, one one-sided Jacobi sweep on A V restores the relative accuracy lost by squaring A, then A V is sorted
 // and orthonormalised. Only rotations are used and u2 = u0 x u1, so det U = det V = +1.
 //// svd
     const Real TINY = sizeof(Real) == 4 ? Real(1e-36) : Real(1e-300);
+    const Real NO_ANGLE = sizeof(Real) == 4 ? Real(1e-30) : Real(1e-300);  // squares below lose digits by underflow
     Pack zero = a[0];
     for (int l = 0; l < WIDTH; ++l) LANE(zero, l) = Real(0);
     const Pack one = zero + Real(1);
@@ -214,9 +290,9 @@
         const Pack h = SQRT(d * d + p2 * p2);
         const Pack den = (d < Real(0) ? -d : d) + h;
         const Pack q = (h + h) * den;
-        const Pack inv = RECIPROCAL_ROOT(q > TINY ? q : one);
-        c = q > TINY ? den * inv : one;
-        sn = q > TINY ? p2 * inv : zero;
+        const Pack inv = RECIPROCAL_ROOT(q > NO_ANGLE ? q : one);
+        c = q > NO_ANGLE ? den * inv : one;
+        sn = q > NO_ANGLE ? p2 * inv : zero;
         sn = d < Real(0) ? -sn : sn;
         return sn * inv * (h + h);
     };

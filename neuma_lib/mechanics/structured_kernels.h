@@ -86,10 +86,7 @@
         } else {
             Pack* const singular = s;
             Pack a[9];
-            for (int l = 0; l < WIDTH; ++l) {
-                const Real* p = (const Real*)F + 9 * (size_t)(first + (l < used ? l : 0));
-                for (int k = 0; k < 9; ++k) LANE(a[k], l) = p[k];
-            }
+            Matrices::load((const Real*)F + 9 * (size_t)first, used, a);
             {SVD}
             for (int k = 0; k < 3; ++k) {
                 u[0][k] = u0[k];
@@ -505,15 +502,13 @@
 //// deformation
         {
             Pack f[9];
+            Matrices::load((const Real*)F + 9 * (size_t)first, used, f);
             for (int i = 0; i < 3; ++i)
-                for (int j = 0; j < 3; ++j)
-                    f[3 * i + j] = y[0] * u[0][i] * v[0][j] + y[1] * u[1][i] * v[1][j] + y[2] * u[2][i] * v[2][j];
-            for (int l = 0; l < used; ++l) {
-                const Real* from = (const Real*)F + 9 * (size_t)(first + l);
-                Real* to = (Real*)out + 9 * (size_t)(first + l);
-                const bool moved = LANE(changed, l);
-                for (int k = 0; k < 9; ++k) to[k] = moved ? LANE(f[k], l) : from[k];
-            }
+                for (int j = 0; j < 3; ++j) {
+                    const Pack moved = y[0] * u[0][i] * v[0][j] + y[1] * u[1][i] * v[1][j] + y[2] * u[2][i] * v[2][j];
+                    f[3 * i + j] = changed ? moved : f[3 * i + j];
+                }
+            Matrices::store((Real*)out + 9 * (size_t)first, used, f);
         }
 
 // K of grad_F = U K V^T with G = U^T g V, unless no row of the pack yields.
@@ -570,22 +565,17 @@
         }
 
 //// stress
+        Pack tau[9];
         for (int i = 0; i < 3; ++i)
-            for (int j = 0; j <= i; ++j) {
-                const Pack tau = y[0] * u[0][i] * u[0][j] + y[1] * u[1][i] * u[1][j] + y[2] * u[2][i] * u[2][j];
-                for (int l = 0; l < used; ++l) {
-                    Real* p = (Real*)out + 9 * (size_t)(first + l);
-                    p[3 * i + j] = p[3 * j + i] = LANE(tau, l);
-                }
-            }
+            for (int j = 0; j <= i; ++j)
+                tau[3 * i + j] = tau[3 * j + i]
+                    = y[0] * u[0][i] * u[0][j] + y[1] * u[1][i] * u[1][j] + y[2] * u[2][i] * u[2][j];
+        Matrices::store((Real*)out + 9 * (size_t)first, used, tau);
 
 // The gradient g of the result.
 //// load_gradient
         Pack g[9];
-        for (int l = 0; l < WIDTH; ++l) {
-            const Real* p = (const Real*)grad_out + 9 * (size_t)(first + (l < used ? l : 0));
-            for (int k = 0; k < 9; ++k) LANE(g[k], l) = l < used ? p[k] : Real(0);
-        }
+        Matrices::load((const Real*)grad_out + 9 * (size_t)first, used, g, false);
 
 // gy, and off = G + G^T by pairs for G = U^T g U
 //// stress_gradient
@@ -641,10 +631,7 @@
         const Pack gy[3] = {zero, zero, zero};
 
 //// store_gradient
-        for (int l = 0; l < used; ++l) {
-            Real* p = (Real*)grad_F + 9 * (size_t)(first + l);
-            for (int k = 0; k < 9; ++k) p[k] = LANE(g[k], l);
-        }
+        Matrices::store((Real*)grad_F + 9 * (size_t)first, used, g);
 
 //// end_rows
     }

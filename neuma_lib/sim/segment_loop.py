@@ -6,6 +6,7 @@ Other laws run in Python between the transfers, step by step (`Simulation.step`)
 from __future__ import annotations
 
 import math
+import weakref
 from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any
@@ -24,6 +25,26 @@ PARTICLE_STEPS = 1_000_000
 
 Parts = Mapping[str, Sequence[tuple[Constitutive, slice, Weights]]]
 """For elasticity and plasticity: law, particles and weights of each region."""
+
+
+def segment_loop(
+    ws: Workspace, parts: Parts, caches_steps: bool, cache_bytes: float, tracers: Repeated | None = None
+) -> SegmentLoop:
+    """A `SegmentLoop` for these arguments, that of the last rollout in the workspace if it has the same ones."""
+    kernels = [
+        (kernel, here.start, here.stop, *(_number(value) for value in given.values()), *map(_number, weights))
+        for regions in parts.values()
+        for law, here, weights in regions
+        for kernel, given in [law.kernel(ws.F[0][here], weights, False)]
+    ]
+    key = kernels, caches_steps, cache_bytes, PARTICLE_STEPS
+    if tracers is not None:
+        return SegmentLoop(ws, parts, caches_steps, cache_bytes, tracers)
+    if ws.loop is None or ws.loop[0] != key:
+        ws.loop = key, SegmentLoop(weakref.proxy(ws), parts, caches_steps, cache_bytes)
+    loop = ws.loop[1]
+    loop.clear_sums()
+    return loop
 
 
 class SegmentLoop:
@@ -54,7 +75,7 @@ class SegmentLoop:
         self._elastic = all(law.identity for law, _, _ in parts["plasticity"])
         analytic = all(law.native_rows for regions in parts.values() for law, _, _ in regions)
         self._flowing = analytic and not self._elastic
-        self._memory: list[Tensor] = []  # of arguments of the kernels
+        self._memory: list[Any] = []  # arguments of the kernels
         self._caches = self._new_caches(cache_bytes) if ws.size.differentiable else {}
         self._per_call = max(1, PARTICLE_STEPS // ws.size.particles)
         self._partials: dict[tuple[str, int], Tensor] = {}  # of analytic laws in the steps of a call
@@ -66,6 +87,11 @@ class SegmentLoop:
         self._forward = LaunchSequence([*before, *ws.native.to_grid, *moves, *after, *last])
         self._stress, self._flow = LaunchSequence(self._stresses()), LaunchSequence(flow)
         self._reverse: LaunchSequence | None = None
+
+    def clear_sums(self) -> None:
+        """Clear gradients of the weights that an interrupted reverse loop has left."""
+        for own in (*self._partials.values(), *(own for sums in self._sums.values() for own in sums)):
+            own.zero_()
 
     def start(self, steps: int | None) -> None:
         """Set the first stress of a segment after one of some steps, or the first of the simulation."""
@@ -151,11 +177,11 @@ class SegmentLoop:
                 elif weights:
                     self._sums[part, k] = tuple(torch.zeros_like(w) for w in weights)
         stresses = [*self._stress_adjoints(), ws.native.add_elastic]
-        transfers = [*ws.native.to_grid, *ws.native.adjoint[self._elastic]]
+        transfers = [*ws.native.to_grid_again, *ws.native.adjoint[self._elastic]]
         if not self._flowing:
             again = [*self._stresses(), *(() if self._elastic else ws.native.to_trial)]
             returns = [] if self._elastic else self._return_adjoints()
-            to_grid, adjoint = ws.native.to_grid, ws.native.adjoint[self._elastic]
+            to_grid, adjoint = ws.native.to_grid_again, ws.native.adjoint[self._elastic]
             again = [] if self._caches_steps else again
             self._reverse = LaunchSequence([*again, *to_grid, *returns, *adjoint, *stresses])
             return
@@ -281,10 +307,8 @@ class SegmentLoop:
         ws, arguments, indices = self._ws, {}, {}
         labels = {arg.label: position for position, arg in enumerate(kernel.adj.args)}
         for name, value in given.items():
-            if isinstance(value, Tensor):
-                self._memory.append(value)
-                value = value.data_ptr()
-            arguments[labels[name]] = value
+            self._memory.append(value)
+            arguments[labels[name]] = _number(value)
         for name, (value, at) in values.items():
             address = (value if at is None else value[0])[here].data_ptr()
             arguments[labels[name]] = address
@@ -302,6 +326,11 @@ def _launch(kernel: wp.Kernel) -> wp.Launch:
     """A recorded launch of a law's kernel, whose arguments are numbers."""
     inputs = [0] * len(kernel.adj.args)
     return wp.launch(kernel, dim=1, inputs=inputs, device="cpu", block_dim=1, record_cmd=True)
+
+
+def _number(value: Tensor | float) -> float:
+    """An argument of a kernel: a number, or the address of a tensor."""
+    return value.data_ptr() if isinstance(value, Tensor) else value
 
 
 def _stride(value: Tensor) -> int:

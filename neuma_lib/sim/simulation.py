@@ -24,7 +24,7 @@ from neuma_lib.sim.kernels import NO_FAULT
 from neuma_lib.sim.memory import MemoryPlan
 from neuma_lib.sim.model import MPM, MaterialRegion, law_weights
 from neuma_lib.sim.scatter import scatter_for
-from neuma_lib.sim.segment_loop import SegmentLoop
+from neuma_lib.sim.segment_loop import SegmentLoop, segment_loop
 from neuma_lib.sim.sequence import Repeated
 from neuma_lib.sim.state import State
 from neuma_lib.sim.workspace import Workspace, WorkspaceSize, pooled_workspace
@@ -225,7 +225,7 @@ class Simulation:
             self._evaluate("elasticity", n, F, weights, ws.tau[ws.stress_at(n)], fill_cache=True)
             ws.trial_deformation(n)
         if not self.plan.caches_steps or ws.native:
-            ws.transfer_to_grid(n)
+            ws.transfer_to_grid(n, again=True)
         self._vjp("plasticity", n, F_trial, weights, ws.grad_F, ws.grad_F_trial, sums)
         ws.transfer_adjoint(n)
         self._vjp("elasticity", n, F, weights, ws.grad_tau, ws.grad_F_elastic, sums)
@@ -254,7 +254,7 @@ class Simulation:
                 for part in PARTS
             }
             caches_steps = self.plan is not None and self.plan.caches_steps
-            self._loop = SegmentLoop(self.workspace, parts, caches_steps, self._law_cache_bytes, tracers)
+            self._loop = segment_loop(self.workspace, parts, caches_steps, self._law_cache_bytes, tracers)
 
     def _advance(
         self, steps: int, weights: Sequence[Tensor], passive: _Tracers | None = None, first: int = 0

@@ -167,6 +167,41 @@
         }
     };
 
+// Nodes that particles touch of a step, one after the other, with their spans and, last, whether they fit.
+//// keep
+    const int rows_kept = c.copies * lines;
+    auto span_of = [&](int row) INLINE { return (int*)spans.data + (row / lines * 6 + 4) * lines + row % lines; };
+    int* const kept_span = (int*)kept_spans.data;
+    auto keep_nodes = [&] {
+        const int room = kept.shape[0];
+        int used = 0;
+        for (int row = 0; row < rows_kept; ++row) {
+            const int low = span_of(row)[0], high = span_of(row)[lines], count = high < low ? 0 : high + 1 - low;
+            kept_span[2 * row] = low, kept_span[2 * row + 1] = high;
+            if (count > room - used) break;
+            for (int k = 0; k < count; ++k)
+                ((Four*)kept.data)[used + k] = ((const Four*)grid.data)[(size_t)row * n + low + k];
+            used += count;
+            if (row == rows_kept - 1) {
+                kept_span[2 * rows_kept] = 1;
+                return;
+            }
+        }
+        kept_span[2 * rows_kept] = 0;
+    };
+
+// Sets the grid to the kept nodes and clears the gradients of the nodes.
+//// restore
+    if (!kept_span[2 * rows_kept]) return 0;
+    for (int copy = 0; copy < c.copies; ++copy) clear(copy, (Real*)grid.data, grid.shape[0], grid.shape[1] * (size_t)4);
+    const Four* next = (const Four*)kept.data;
+    for (int row = 0; row < rows_kept; ++row) {
+        const int low = kept_span[2 * row], high = kept_span[2 * row + 1];
+        span_of(row)[0] = low, span_of(row)[lines] = high;
+        for (int k = low; k <= high; ++k) ((Four*)grid.data)[(size_t)row * n + k] = *next++;
+    }
+    return 1;
+
 //// momentum
     // q = (m v + A d, m) at a node and what it grows by from node to node, as in `kernels.p2g`: rows of equal columns
     struct Momentum { Row q, A[3]; Real stress; };
@@ -213,6 +248,7 @@
         }
     }
     for (int copy = 0; copy < c.copies; ++copy) grow(copy);
+    keep_nodes();
 
 // v_i = (m v)_i / m_i + dt g without walls and clamps
 //// grid_update

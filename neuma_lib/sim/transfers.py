@@ -4,7 +4,8 @@
 
 - Nodes that no particle touches are neither cleared nor updated. ``spans`` (copies, 6, nodes^2) has the first and last
   in each row of the grid.
-- Grids of earlier steps are not kept. The reverse loop computes them again, which takes less time than the laws.
+- Of earlier steps only these nodes are kept, one after the other, if they are not more than the particles. Else the
+  reverse loop computes them again.
 - Contact and clamps are passes over the particles before and after the loops, with the functions of other devices.
   Clamped particles have no mass in ``mass_now``.
 """
@@ -54,12 +55,19 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
     module = f"neuma_lib.sim.transfers_{str(dtype).removeprefix('torch.')}_{'_'.join(features)}"
     kernel = functools.partial(wp.kernel, enable_backward=False, module=module)
 
-    @wp.func_native(_native(dtype, "lanes", "block", "spans", "momentum", "p2g"))
+    @wp.func_native(_native(dtype, "lanes", "block", "spans", "keep", "momentum", "p2g"))
     def p2g_loop(
         c: GridConstants, x: wp.array(dtype=vec3), v: wp.array(dtype=vec3), C: wp.array(dtype=mat33),
         tau: wp.array(dtype=mat33), mass: wp.array(dtype=real), vol0: wp.array(dtype=real),
-        spans: wp.array(dtype=wp.int32), grid: wp.array2d(dtype=vec4),
+        spans: wp.array(dtype=wp.int32), grid: wp.array2d(dtype=vec4), kept: wp.array(dtype=vec4),
+        kept_spans: wp.array(dtype=wp.int32),
     ): ...  # fmt: skip
+
+    @wp.func_native(_native(dtype, "spans", "keep", "restore"))
+    def restore_nodes(
+        c: GridConstants, spans: wp.array(dtype=wp.int32), grid: wp.array2d(dtype=vec4), kept: wp.array(dtype=vec4),
+        kept_spans: wp.array(dtype=wp.int32),
+    ) -> wp.int32: ...  # fmt: skip
 
     @wp.func_native(_native(dtype, "grid_update"))
     def grid_loop(
@@ -184,6 +192,8 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         c: GridConstants,
         now: wp.int32,
         stressed: wp.int32,
+        cached: wp.int32,
+        again: wp.int32,
         x: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
         C: wp.array2d(dtype=mat33),
@@ -193,12 +203,18 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         v_now: wp.array(dtype=vec3),
         spans: wp.array(dtype=wp.int32),
         grids: wp.array2d(dtype=vec4),
+        kept: wp.array2d(dtype=vec4),
+        kept_spans: wp.array2d(dtype=wp.int32),
     ):
-        """As `kernels.p2g`, and clears all grids before."""
+        """As `kernels.p2g`, and clears all grids before. ``again``: from the nodes that the first time has kept, if it
+        has."""
+        if again == 1:
+            if restore_nodes(c, spans, grids, kept[cached], kept_spans[cached]) == 1:
+                return
+        v_p = v[now]
         if wp.static(contact):
-            p2g_loop(c, x[now], v_now, C[now], tau[stressed], mass_now, vol_now, spans, grids)
-        else:
-            p2g_loop(c, x[now], v[now], C[now], tau[stressed], mass_now, vol_now, spans, grids)
+            v_p = v_now
+        p2g_loop(c, x[now], v_p, C[now], tau[stressed], mass_now, vol_now, spans, grids, kept[cached], kept_spans[cached])
 
     @kernel
     def grid_update(
