@@ -82,7 +82,7 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         faults: wp.array2d(dtype=wp.int64),
     ): ...  # fmt: skip
 
-    @wp.func_native(_native(dtype, "trial"))
+    @wp.func_native(_native(dtype, "lanes", "trial"))
     def trial_loop(
         c: GridConstants, C_after: wp.array(dtype=mat33), F: wp.array(dtype=mat33), F_trial: wp.array(dtype=mat33)
     ): ...  # fmt: skip
