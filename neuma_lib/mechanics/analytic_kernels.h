@@ -574,6 +574,9 @@
     auto load = [&](uint64_t array, size_t first, int used, Pack* x) {
         Matrices::load((const Real*)array + 9 * first, used, x);
     };
+    auto prefetch = [&](uint64_t array, size_t first) {
+        Matrices::prefetch((const Real*)array + 9 * (first + WIDTH), 9 * WIDTH);
+    };
     auto store = [&](uint64_t array, size_t first, int used, const Pack* x) {
         Matrices::store((Real*)array + 9 * first, used, x);
     };
@@ -600,9 +603,11 @@
         const Real* const c = (const Real*)rows + (COEFFICIENTS + 1) * copy;
         Pack* const kept = cache ? (Pack*)cache + KEPT * pack : nullptr;
         Pack x[9], value[9];
+        if (cache) Matrices::prefetch((Real*)(kept + KEPT), KEPT * WIDTH);
         load(F, first, used, x);
 
 //// evaluate
+        prefetch(out, first);
         FORWARD(c, x, value, kept);
         store(out, first, used, value);
     }
@@ -618,6 +623,8 @@
 // `rows` are those of the plasticity and F is F_trial.
 //// evaluate_flow
         Pack tau[9];
+        prefetch(out, first);
+        prefetch(stress_out, first);
         flow(c, (const Real*)elastic_rows + (COEFFICIENTS + 1) * copy, x, value, tau, kept);
         store(out, first, used, value);
         store(stress_out, first, used, tau);

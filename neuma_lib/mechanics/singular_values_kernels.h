@@ -89,6 +89,12 @@
             #undef HALVES
         }
 #endif
+        // Loads memory of a later pack, which is not in the caches of a CPU after many steps
+        static void prefetch(const Real* p, int count) {
+#if !defined(__CUDA_ARCH__)
+            for (int k = 0; k < count; k += 64 / sizeof(Real)) __builtin_prefetch(p + k, 1);
+#endif
+        }
         static void load(const Real* p, int used, Pack* x, bool repeats = true) {
 #if !defined(__CUDA_ARCH__)
             if (used == WIDTH && WIDTH % 16 == 0) {

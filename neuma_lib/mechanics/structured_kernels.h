@@ -75,6 +75,8 @@
             const int place = first / CACHED_WIDTH;
             return *(Pack*)((Real*)cache + (CACHED * place + k) * (size_t)CACHED_WIDTH + first % CACHED_WIDTH);
         };
+        if (cached && first % CACHED_WIDTH == 0)
+            Matrices::prefetch((Real*)cache + CACHED * (size_t)(first / CACHED_WIDTH + 1) * CACHED_WIDTH, CACHED * CACHED_WIDTH);
         if (cached == 2) {
             for (int k = 0; k < 3; ++k) {
                 for (int i = 0; i < 3; ++i) {
@@ -508,6 +510,7 @@
                     const Pack moved = y[0] * u[0][i] * v[0][j] + y[1] * u[1][i] * v[1][j] + y[2] * u[2][i] * v[2][j];
                     f[3 * i + j] = changed ? moved : f[3 * i + j];
                 }
+            Matrices::prefetch((Real*)out + 9 * (size_t)(first + 2 * WIDTH), 9 * WIDTH);
             Matrices::store((Real*)out + 9 * (size_t)first, used, f);
         }
 
@@ -570,6 +573,7 @@
             for (int j = 0; j <= i; ++j)
                 tau[3 * i + j] = tau[3 * j + i]
                     = y[0] * u[0][i] * u[0][j] + y[1] * u[1][i] * u[1][j] + y[2] * u[2][i] * u[2][j];
+        Matrices::prefetch((Real*)out + 9 * (size_t)(first + 2 * WIDTH), 9 * WIDTH);
         Matrices::store((Real*)out + 9 * (size_t)first, used, tau);
 
 // The gradient g of the result.

@@ -130,7 +130,7 @@ class Simulation:
         result = tuple(value.new_empty(len(frames), *value.shape) for value in start)
         for state, value in zip(states, start, strict=True):
             state[0].copy_(value)
-        if self._uses_graphs:
+        if self._uses_graphs or self._loops:
             ws.load_weights(weights)
             weights = ws.weights
         passive = None if tracers is None else _Tracers(ws, tracers, frames)
@@ -180,7 +180,7 @@ class Simulation:
     ) -> tuple[tuple[Tensor, ...], list[Tensor]]:
         """From gradients of the states at the frames to those of the initial state and of the weights."""
         ws = self.workspace
-        if self._uses_graphs:
+        if self._uses_graphs or self._loops:
             weights, grad_weights = ws.weights, ws.grad_weights
         else:
             grad_weights = [torch.zeros_like(w) for w in weights]

@@ -112,6 +112,10 @@
         for (int l = 0; l < used; ++l) x[l] = p[l];
         return x;
     };
+    // Loads memory of a later block that will be written, which is not in the caches after many steps
+    auto prefetch = [](const Real* p, int count) INLINE {
+        for (int k = 0; k < count; k += 64 / sizeof(Real)) __builtin_prefetch(p + k, 1);
+    };
     // F_trial = (I + dt C) F
     auto store_trial = [&](Real* out, const Real* from, const Row* C, int used) INLINE {
         Row F[9], trial[9];
@@ -367,6 +371,10 @@
             }
             *(Row*)all[l] = total, *(Row*)along_i[l] = total_i, *(Row*)along_j[l] = total_j;
         }
+        prefetch((Real*)C_after.data + 9 * (begin + 32), 9 * 16);
+        prefetch((Real*)F_trial.data + 9 * (begin + 32), 9 * 16);
+        prefetch((Real*)x_after.data + 3 * (begin + 32), 3 * 16);
+        prefetch((Real*)v_after.data + 3 * (begin + 32), 3 * 16);
         Row v_p[4], place[3], moment[3][4], C_p[9];
         load_lanes((const Real*)x.data + 3 * begin, used, place);
         add_nodes(all, block.w[2], v_p);
