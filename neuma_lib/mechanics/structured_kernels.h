@@ -68,7 +68,8 @@
         const int used = n - first < WIDTH ? n - first : WIDTH;
 #endif
 
-// u[k], v[k] and s[k], from the cache if it has them.
+// u[k], v[k] and s[k]. They are written to the cache if `cached` is 1 and read from it if it is 2. If it is 3, s[k] are the
+// stretches after the return map that has written them, because it keeps u and v.
 //// decompose
         Pack u[3][3], v[3][3], s[3];
         auto kept = [&](int k) -> Pack& {
@@ -77,13 +78,13 @@
         };
         if (cached && first % CACHED_WIDTH == 0)
             Matrices::prefetch((Real*)cache + CACHED * (size_t)(first / CACHED_WIDTH + 1) * CACHED_WIDTH, CACHED * CACHED_WIDTH);
-        if (cached == 2) {
+        if (cached > 1) {
             for (int k = 0; k < 3; ++k) {
                 for (int i = 0; i < 3; ++i) {
                     u[k][i] = kept(3 * k + i);
                     v[k][i] = kept(9 + 3 * k + i);
                 }
-                s[k] = kept(18 + k);
+                s[k] = kept((cached == 2 ? 18 : 21) + k);
             }
         } else {
             Pack* const singular = s;
@@ -503,6 +504,7 @@
 
 //// deformation
         {
+            for (int k = 0; k < (cached == 1 ? 3 : 0); ++k) kept(21 + k) = y[k];
             Pack f[9];
             Matrices::load((const Real*)F + 9 * (size_t)first, used, f);
             for (int i = 0; i < 3; ++i)
@@ -635,6 +637,11 @@
         const Pack gy[3] = {zero, zero, zero};
 
 //// store_gradient
+        if (adds) {
+            Pack before[9];
+            Matrices::load((const Real*)grad_F + 9 * (size_t)first, used, before);
+            for (int k = 0; k < 9; ++k) g[k] = g[k] + before[k];
+        }
         Matrices::store((Real*)grad_F + 9 * (size_t)first, used, g);
 
 //// end_rows
