@@ -141,8 +141,8 @@ def add_source(kind: str, dtype: torch.dtype) -> str:
 def evaluate_kernel(kind: str, dtype: torch.dtype):
     """Kernel (F, W0, W1, W2, index of the base, four constants, n, cached, cache, out), launched by `launch_blocks`.
 
-    If ``cached`` is 1, it writes the SVD to the cache (packs, CACHED, EVALUATE_WIDTH). If it is 3, F is the result of the
-    return map that has written the cache.
+    If ``cached`` is 1, it writes the SVD to the cache (packs, CACHED, EVALUATE_WIDTH). If it is 3, F is the result of
+    the return map that has written the cache.
     """
     real, _, _ = warp_types(dtype)
 
@@ -166,8 +166,8 @@ def evaluate_kernel(kind: str, dtype: torch.dtype):
 def vjp_kernel(kind: str, dtype: torch.dtype):
     """Kernel (F, W0, W1, W2, index of the base, four constants, n, cached, cache, adds, grad_out, grad_F, ...).
 
-    If ``cached`` is 2 or 3, it reads the SVD from the cache. If ``adds`` is 1, it adds to grad_F. It adds the gradients of the weights to three totals on a CPU,
-    and writes them to partials (blocks, weights) on a GPU.
+    If ``cached`` is 2 or 3, it reads the SVD from the cache. If ``adds`` is 1, it adds to grad_F. It adds the gradients
+    of the weights to three totals on a CPU, and writes them to partials (blocks, weights) on a GPU.
     """
     real, _, _ = warp_types(dtype)
 
@@ -274,8 +274,8 @@ def vjp(
             W, blocks = [w.detach().contiguous() for w in weights], _blocks(F)
             partials = None if F.device.type == "cpu" else F.new_empty(blocks, weight_count(kind))
             cached = 0 if cache is None else 2
-            inputs = (*W, constants.kind, *constants.values, len(F), cached, cache, 0, grad_out, result, *sums)
-            launch_blocks(vjp_kernel(kind, F.dtype), blocks, THREADS[F.dtype], F, *inputs, partials)
+            inputs = *W, constants.kind, *constants.values, len(F), cached, cache, 0, grad_out, result
+            launch_blocks(vjp_kernel(kind, F.dtype), blocks, THREADS[F.dtype], F, *inputs, *sums, partials)
             if partials is not None:
                 columns = -(-weight_count(kind) // LANES)
                 launch_blocks(add_kernel(kind, F.dtype), columns, LANES * GROUPS, partials, blocks, *sums)

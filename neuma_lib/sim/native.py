@@ -63,12 +63,14 @@ class NativeTransfers:
     def record_forward(self) -> None:
         """Record the launches of a step."""
         k, N = self._kernels, self._ws.size.particles
-        before = [self._launch(k.hold, N)] if "clamps" in self._ws.features else []
-        before += [self._launch(k.touch)] if "contact" in self._ws.features else []
-        self.to_grid, self.to_grid_again = (
-            [*before, self._launch(k.p2g, again=again), self._launch(k.grid_update)]
-            for again in (0, int(self._keeps_nodes))
-        )
+        hold = [self._launch(k.hold, N)] if "clamps" in self._ws.features else []
+
+        def to_grid(again: int) -> list[Repeated]:
+            touch = [self._launch(k.touch, again=again)] if "contact" in self._ws.features else []
+            p2g = self._launch(k.p2g, again=again and int(self._keeps_nodes))
+            return [*hold, *touch, p2g, self._launch(k.grid_update)]
+
+        self.to_grid, self.to_grid_again = to_grid(0), to_grid(1)
         self.to_trial = [self._launch(k.trial_deformation)]
         self.to_particles = {elastic: self._moves(elastic) for elastic in (False, True)}
         self._steps = {

@@ -198,9 +198,7 @@ class SegmentLoop:
             part = "elasticity" if not self._flowing or self._is_separate(k) else "plasticity"
             law, here, weights = self._parts[part][k]
             keeps = ws.size.differentiable and (
-                elastic.keeps_singular_values
-                or part == "plasticity"
-                and plastic.keeps_singular_values
+                elastic.keeps_singular_values or part == "plasticity" and plastic.keeps_singular_values
             )
             shared = part == "plasticity" and not self._is_analytic(k)
             if not keeps and not shared:
@@ -281,7 +279,8 @@ class SegmentLoop:
                 values = dict(F=F, returned_F=returned, grad_stress=(ws.grad_tau, None), **grads)
                 launches.append(self._launch(kernel, *self._both(k), by_step, values))
                 continue
-            if cache is not None and len(cache) < ws.size.n_cached_steps:  # values of the step are overwritten
+            # Singular values of the step are overwritten.
+            if cache is not None and len(cache) < ws.size.n_cached_steps:
                 launches.append(self._one("plasticity", k, False, cache, {}, dict(F=F, out=returned)))
             own, given = self._shared(k)
             values = dict(F=returned, grad_out=(ws.grad_tau, None), grad_F=(ws.grad_F, None))

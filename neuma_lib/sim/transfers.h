@@ -559,22 +559,20 @@
         store_lanes((Real*)grad_x.data + 3 * begin, used, g_x);
     }
 
-// Particles that may touch an obstacle: those near a face of the unit cube, or all if there are other obstacles. The others
-// keep their velocity and have no displacement.
+// Particles that may touch an obstacle: those near a face of the unit cube, or all if there are other obstacles. If there are
+// some, the others keep their velocity. They have no displacement, as known `again` in the reverse loop.
 //// near
     int count = 0;
     const int N = c.copies * c.particles;
-    for (int k = 0; k < 3 * N; ++k) ((Real*)v_now.data)[k] = ((const Real*)v.data)[k];
-    for (int k = 0; k < 3 * N; ++k) ((Real*)stuck.data)[k] = Real(0);
+    for (int k = 0; k < (again ? 0 : 3 * N); ++k) ((Real*)stuck.data)[k] = Real(0);
     if (others)
         for (; count < N; ++count) ((int*)near.data)[count] = count;
     else
         for (int begin = 0; begin < N; begin += 16) {
             const int used = N - begin < 16 ? N - begin : 16;
-            Row x_p[3], r;
+            Row x_p[3];
             load_lanes((const Real*)x.data + 3 * begin, used, x_p);
-            for (int l = 0; l < 16; ++l) r[l] = ((const Real*)radius.data)[begin + (l < used ? l : 0)];
-            const Row far = Real(1) - r;
+            const Row r = load_numbers((const Real*)radius.data + begin, used), far = Real(1) - r;
             auto outside = (x_p[0] < r) | (x_p[0] > far);
             for (int axis = 1; axis < 3; ++axis) outside |= (x_p[axis] < r) | (x_p[axis] > far);
             bool any = false;
@@ -582,6 +580,7 @@
             for (int l = 0; l < (any ? used : 0); ++l)
                 if (outside[l]) ((int*)near.data)[count++] = begin + l;
         }
+    for (int k = 0; k < (count ? 3 * N : 0); ++k) ((Real*)v_now.data)[k] = ((const Real*)v.data)[k];
     return count;
 
 // Clears what is between the particles that may touch an obstacle.

@@ -140,7 +140,7 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
 
     @wp.func_native(_native(dtype, "lanes", "near"))
     def near_obstacles(
-        c: GridConstants, others: wp.int32, x: wp.array(dtype=vec3), v: wp.array(dtype=vec3),
+        c: GridConstants, others: wp.int32, again: wp.int32, x: wp.array(dtype=vec3), v: wp.array(dtype=vec3),
         radius: wp.array(dtype=real), v_now: wp.array(dtype=vec3), stuck: wp.array(dtype=vec3),
         near: wp.array(dtype=wp.int32),
     ) -> wp.int32: ...  # fmt: skip
@@ -156,6 +156,7 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         now: wp.int32,
         after: wp.int32,
         pose: wp.int32,
+        again: wp.int32,
         x: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
         radius_now: wp.array(dtype=real),
@@ -166,12 +167,12 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         near: wp.array(dtype=wp.int32),
         touching: wp.array(dtype=wp.int32),
     ):
-        """Velocities of the particles after contact with obstacles.
+        """Velocities of the particles after contact with obstacles, if one touches.
 
         Sets the particles that touch one, ``near[: touching[0]]``, in increasing order.
         """
         count = near_obstacles(
-            c, obstacles.shape[1] - c.faces, x[now], v[now], radius_now, v_now, stuck[after], near
+            c, obstacles.shape[1] - c.faces, again, x[now], v[now], radius_now, v_now, stuck[after], near
         )
         number = wp.int32(0)
         for q in range(count):
@@ -201,6 +202,7 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         mass_now: wp.array(dtype=real),
         vol_now: wp.array(dtype=real),
         v_now: wp.array(dtype=vec3),
+        touching: wp.array(dtype=wp.int32),
         spans: wp.array(dtype=wp.int32),
         grids: wp.array2d(dtype=vec4),
         kept: wp.array2d(dtype=vec4),
@@ -213,8 +215,11 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
                 return
         v_p = v[now]
         if wp.static(contact):
-            v_p = v_now
-        p2g_loop(c, x[now], v_p, C[now], tau[stressed], mass_now, vol_now, spans, grids, kept[cached], kept_spans[cached])
+            if touching[0] > 0:
+                v_p = v_now
+        p2g_loop(
+            c, x[now], v_p, C[now], tau[stressed], mass_now, vol_now, spans, grids, kept[cached], kept_spans[cached]
+        )  # fmt: skip
 
     @kernel
     def grid_update(
@@ -365,6 +370,7 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         mass_now: wp.array(dtype=real),
         vol_now: wp.array(dtype=real),
         v_now: wp.array(dtype=vec3),
+        touching: wp.array(dtype=wp.int32),
         grids: wp.array2d(dtype=vec4),
         grad_x: wp.array(dtype=vec3),
         grad_v: wp.array(dtype=vec3),
@@ -372,36 +378,13 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         grad_tau: wp.array(dtype=mat33),
     ):
         """As `adjoint_kernels.p2g_adjoint` without contact: grad_v is that of the velocity after it."""
+        v_p = v[now]
         if wp.static(contact):
-            p2g_adjoint_loop(
-                c,
-                x[now],
-                v_now,
-                C[now],
-                tau[stressed],
-                mass_now,
-                vol_now,
-                grids[2],
-                grad_x,
-                grad_v,
-                grad_C,
-                grad_tau,
-            )
-        else:
-            p2g_adjoint_loop(
-                c,
-                x[now],
-                v[now],
-                C[now],
-                tau[stressed],
-                mass_now,
-                vol_now,
-                grids[2],
-                grad_x,
-                grad_v,
-                grad_C,
-                grad_tau,
-            )
+            if touching[0] > 0:
+                v_p = v_now
+        p2g_adjoint_loop(
+            c, x[now], v_p, C[now], tau[stressed], mass_now, vol_now, grids[2], grad_x, grad_v, grad_C, grad_tau
+        )  # fmt: skip
 
     @kernel
     def touch_adjoint_kernel(
