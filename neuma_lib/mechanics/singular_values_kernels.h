@@ -66,14 +66,15 @@
     #define DIVIDE(x, y) Newton::quotient(x, y)
 #endif
 
-// Row-major 3x3 matrices of consecutive particles. Lanes after the last one, `used`, receive the first, or zeros.
+// Row-major 3x3 matrices of consecutive particles, for packs of 16 or more. Lanes after the last one, `used`, receive the
+// first, or zeros. Also used by transfers.h.
 //// matrices
     struct Matrices {
 #if !defined(__CUDA_ARCH__)
         typedef Real Four __attribute__((vector_size(4 * sizeof(Real)), aligned(sizeof(Real))));
         typedef Real Eight __attribute__((vector_size(8 * sizeof(Real))));
-        typedef Real Sixteen __attribute__((vector_size(16 * sizeof(Real))));
-        // Transposes 4 x 4 numbers of four particles in each quarter of the lanes.
+        typedef Real Sixteen __attribute__((vector_size(16 * sizeof(Real)), aligned(sizeof(Real))));
+        // Transposes 4 x 4 numbers in each quarter of the lanes.
         static __attribute__((always_inline)) void transpose(Sixteen* r) {
             #define PAIRS(a, b, i) __builtin_shufflevector(a, b, i, i + 16, i + 1, i + 17, i + 4, i + 20, i + 5, i + 21, \
                 i + 8, i + 24, i + 9, i + 25, i + 12, i + 28, i + 13, i + 29)
@@ -88,8 +89,29 @@
             #undef PAIRS
             #undef HALVES
         }
+        // Four numbers of each of 16 particles, whose first ones are `stride` apart
+        static __attribute__((always_inline)) void load_four(const Real* p, int stride, Sixteen* x) {
+            #define EIGHT(q) __builtin_shufflevector(*(const Four*)(q), *(const Four*)((q) + 4 * stride), 0, 1, 2, 3, 4, 5, 6, 7)
+            for (int j = 0; j < 4; ++j) {
+                const Eight low = EIGHT(p + j * stride), high = EIGHT(p + (j + 8) * stride);
+                x[j] = __builtin_shufflevector(low, high, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+            }
+            #undef EIGHT
+            transpose(x);
+        }
+        static __attribute__((always_inline)) void store_four(Real* p, int stride, Sixteen a, Sixteen b, Sixteen c, Sixteen d) {
+            Sixteen r[4] = {a, b, c, d};
+            transpose(r);
+            for (int j = 0; j < 4; ++j) {
+                Real* const q = p + j * stride;
+                *(Four*)q = __builtin_shufflevector(r[j], r[j], 0, 1, 2, 3);
+                *(Four*)(q + 4 * stride) = __builtin_shufflevector(r[j], r[j], 4, 5, 6, 7);
+                *(Four*)(q + 8 * stride) = __builtin_shufflevector(r[j], r[j], 8, 9, 10, 11);
+                *(Four*)(q + 12 * stride) = __builtin_shufflevector(r[j], r[j], 12, 13, 14, 15);
+            }
+        }
 #endif
-        // Loads memory of a later pack, which is not in the caches of a CPU after many steps
+        // Loads memory of a later pack, which is not in the caches of a CPU after many steps.
         static void prefetch(const Real* p, int count) {
 #if !defined(__CUDA_ARCH__)
             for (int k = 0; k < count; k += 64 / sizeof(Real)) __builtin_prefetch(p + k, 1);
@@ -97,47 +119,27 @@
         }
         static void load(const Real* p, int used, Pack* x, bool repeats = true) {
 #if !defined(__CUDA_ARCH__)
-            if (used == WIDTH && WIDTH % 16 == 0) {
-                for (int part = 0; part < WIDTH / 16; ++part, p += 9 * 16) {
-                    for (int k = 0; k < 8; k += 4) {
-                        Sixteen r[4];
-                        for (int j = 0; j < 4; ++j) {
-                            const Real* const q = p + 9 * j + k;
-                            const Eight low = __builtin_shufflevector(*(const Four*)q, *(const Four*)(q + 36), 0, 1, 2, 3, 4, 5, 6, 7);
-                            const Eight high = __builtin_shufflevector(*(const Four*)(q + 72), *(const Four*)(q + 108), 0, 1, 2, 3, 4, 5, 6, 7);
-                            r[j] = __builtin_shufflevector(low, high, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
-                        }
-                        transpose(r);
-                        for (int j = 0; j < 4; ++j) ((Sixteen*)&x[k + j])[part] = r[j];
-                    }
-                    for (int l = 0; l < 16; ++l) LANE(x[8], 16 * part + l) = p[9 * l + 8];
+            for (int part = 0; part < (used == WIDTH ? WIDTH / 16 : 0); ++part, p += 9 * 16)
+                for (int start = 0; start < 9; start += 4) {  // the last four overlap, so that nothing after the end is read
+                    const int k = start == 8 ? 5 : start;
+                    Sixteen r[4];
+                    load_four(p + k, 9, r);
+                    for (int j = start - k; j < 4; ++j) ((Sixteen*)&x[k + j])[part] = r[j];
                 }
-                return;
-            }
+            if (used == WIDTH && WIDTH % 16 == 0) return;
 #endif
             for (int l = 0; l < WIDTH; ++l)
                 for (int k = 0; k < 9; ++k) LANE(x[k], l) = l < used || repeats ? p[9 * (l < used ? l : 0) + k] : Real(0);
         }
         static void store(Real* p, int used, const Pack* x) {
 #if !defined(__CUDA_ARCH__)
-            if (used == WIDTH && WIDTH % 16 == 0) {
-                for (int part = 0; part < WIDTH / 16; ++part, p += 9 * 16) {
-                    for (int k = 0; k < 8; k += 4) {
-                        Sixteen r[4];
-                        for (int j = 0; j < 4; ++j) r[j] = ((const Sixteen*)&x[k + j])[part];
-                        transpose(r);
-                        for (int j = 0; j < 4; ++j) {
-                            Real* const q = p + 9 * j + k;
-                            *(Four*)q = __builtin_shufflevector(r[j], r[j], 0, 1, 2, 3);
-                            *(Four*)(q + 36) = __builtin_shufflevector(r[j], r[j], 4, 5, 6, 7);
-                            *(Four*)(q + 72) = __builtin_shufflevector(r[j], r[j], 8, 9, 10, 11);
-                            *(Four*)(q + 108) = __builtin_shufflevector(r[j], r[j], 12, 13, 14, 15);
-                        }
-                    }
-                    for (int l = 0; l < 16; ++l) p[9 * l + 8] = LANE(x[8], 16 * part + l);
-                }
-                return;
+            for (int part = 0; part < (used == WIDTH ? WIDTH / 16 : 0); ++part, p += 9 * 16) {
+                const auto of = [&](int k) { return ((const Sixteen*)&x[k])[part]; };
+                store_four(p, 9, of(0), of(1), of(2), of(3));
+                store_four(p + 4, 9, of(4), of(5), of(6), of(7));
+                for (int l = 0; l < 16; ++l) p[9 * l + 8] = LANE(x[8], 16 * part + l);
             }
+            if (used == WIDTH && WIDTH % 16 == 0) return;
 #endif
             for (int l = 0; l < used; ++l)
                 for (int k = 0; k < 9; ++k) p[9 * l + k] = LANE(x[k], l);

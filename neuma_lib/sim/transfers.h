@@ -11,6 +11,9 @@
     typedef Real Eight __attribute__((vector_size(8 * sizeof(Real)), aligned(sizeof(Real))));
     typedef Real Row __attribute__((vector_size(16 * sizeof(Real)), aligned(sizeof(Real))));
     typedef int Index __attribute__((vector_size(4 * sizeof(int))));
+    typedef Row Pack;
+    const int WIDTH = 16;
+    #define LANE(x, l) ((Real*)&(x))[l]
     #define SHUFFLE __builtin_shufflevector
     #define INLINE __attribute__((always_inline))
     const int n = c.n;
@@ -52,69 +55,13 @@
             for (int l = 0; l < used; ++l)
                 for (int axis = 0; axis < 3; ++axis) p[3 * l + axis] = x[axis][l];
     };
-    // Transposes 4 x 4 numbers in each quarter of the lanes.
-    auto transpose = [](Row* r) INLINE {
-        #define PAIRS(a, b, i) SHUFFLE(a, b, i, i + 16, i + 1, i + 17, i + 4, i + 20, i + 5, i + 21, \
-            i + 8, i + 24, i + 9, i + 25, i + 12, i + 28, i + 13, i + 29)
-        #define HALVES(a, b, i) SHUFFLE(a, b, i, i + 1, i + 16, i + 17, i + 4, i + 5, i + 20, i + 21, \
-            i + 8, i + 9, i + 24, i + 25, i + 12, i + 13, i + 28, i + 29)
-        const Row a = PAIRS(r[0], r[1], 0), b = PAIRS(r[2], r[3], 0), d = PAIRS(r[0], r[1], 2), e = PAIRS(r[2], r[3], 2);
-        r[0] = HALVES(a, b, 0), r[1] = HALVES(a, b, 2), r[2] = HALVES(d, e, 0), r[3] = HALVES(d, e, 2);
-        #undef PAIRS
-        #undef HALVES
-    };
-    // Four numbers of each particle, whose first ones are `stride` apart
-    auto load_four = [&](const Real* p, int stride, Row* x) INLINE {
-        for (int j = 0; j < 4; ++j) {
-            const Real* const q = p + j * stride;
-            const Eight low = SHUFFLE(*(const Four*)q, *(const Four*)(q + 4 * stride), 0, 1, 2, 3, 4, 5, 6, 7);
-            const Eight high = SHUFFLE(*(const Four*)(q + 8 * stride), *(const Four*)(q + 12 * stride), 0, 1, 2, 3, 4, 5, 6, 7);
-            x[j] = SHUFFLE(low, high, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
-        }
-        transpose(x);
-    };
-    auto store_four = [&](Real* p, int stride, Row a, Row b, Row d, Row e) INLINE {
-        Row r[4] = {a, b, d, e};
-        transpose(r);
-        for (int j = 0; j < 4; ++j) {
-            Real* const q = p + j * stride;
-            *(Four*)q = SHUFFLE(r[j], r[j], 0, 1, 2, 3);
-            *(Four*)(q + 4 * stride) = SHUFFLE(r[j], r[j], 4, 5, 6, 7);
-            *(Four*)(q + 8 * stride) = SHUFFLE(r[j], r[j], 8, 9, 10, 11);
-            *(Four*)(q + 12 * stride) = SHUFFLE(r[j], r[j], 12, 13, 14, 15);
-        }
-    };
-    auto load_matrices = [&](const Real* p, int used, Row* x) INLINE {
-        Real padded[9 * 16];
-        if (used < 16) {
-            for (int k = 0; k < 9 * 16; ++k) padded[k] = k < 9 * used ? p[k] : Real(0);
-            p = padded;
-        }
-        Row last[4];
-        load_four(p, 9, x);
-        load_four(p + 4, 9, x + 4);
-        load_four(p + 5, 9, last);
-        x[8] = last[3];
-    };
-    auto store_matrices = [&](Real* p, int used, const Row* x) INLINE {
-        Real padded[9 * 16], last[16];
-        Real* const to = used < 16 ? padded : p;
-        *(Row*)last = x[8];
-        store_four(to, 9, x[0], x[1], x[2], x[3]);
-        store_four(to + 4, 9, x[4], x[5], x[6], x[7]);
-        for (int l = 0; l < 16; ++l) to[9 * l + 8] = last[l];
-        if (used < 16)
-            for (int k = 0; k < 9 * used; ++k) p[k] = padded[k];
-    };
+    auto load_matrices = [](const Real* p, int used, Row* x) INLINE { Matrices::load(p, used, x, false); };
+    auto store_matrices = [](Real* p, int used, const Row* x) INLINE { Matrices::store(p, used, x); };
     auto load_numbers = [](const Real* p, int used) INLINE {
         if (used == 16) return *(const Row*)p;
         Row x = {};
         for (int l = 0; l < used; ++l) x[l] = p[l];
         return x;
-    };
-    // Loads memory of a later block that will be written, which is not in the caches after many steps
-    auto prefetch = [](const Real* p, int count) INLINE {
-        for (int k = 0; k < count; k += 64 / sizeof(Real)) __builtin_prefetch(p + k, 1);
     };
     // F_trial = (I + dt C) F
     auto store_trial = [&](Real* out, const Real* from, const Row* C, int used) INLINE {
@@ -180,7 +127,7 @@
     auto add_nodes = [&](const Rows& rows, const Real (*w)[16], Row* sum) INLINE {
         for (int node = 0; node < 3; ++node) {
             Row x[4];
-            load_four(rows[0] + 4 * node, 16, x);
+            Matrices::load_four(rows[0] + 4 * node, 16, x);
             for (int k = 0; k < 4; ++k) sum[k] = node ? sum[k] + *(const Row*)w[node] * x[k] : *(const Row*)w[node] * x[k];
         }
     };
@@ -282,14 +229,16 @@
         load_lanes((const Real*)v.data + 3 * begin, used, q);
         m = load_numbers((const Real*)mass.data + begin, used);
         stress = stress_factor * load_numbers((const Real*)vol0.data + begin, used);
+        Matrices::prefetch((const Real*)C.data + 9 * (begin + 32), 9 * 16);
+        Matrices::prefetch((const Real*)tau.data + 9 * (begin + 32), 9 * 16);
         const Row m_dx = c.dx * m, stress_dx = c.dx * stress, none = {};
         for (int k = 0; k < 9; ++k) A[k] = m_dx * A[k] - stress_dx * T[k];
         for (int k = 0; k < 3; ++k) {
             q[k] = m * q[k];
             for (int axis = 0; axis < 3; ++axis) q[k] -= *(const Row*)block.f[axis] * A[3 * k + axis];
         }
-        store_four(momenta[0], 16, q[0], q[1], q[2], m);
-        for (int k = 0; k < 3; ++k) store_four(momenta[0] + 4 + 4 * k, 16, A[k], A[3 + k], A[6 + k], none);
+        Matrices::store_four(momenta[0], 16, q[0], q[1], q[2], m);
+        for (int k = 0; k < 3; ++k) Matrices::store_four(momenta[0] + 4 + 4 * k, 16, A[k], A[3 + k], A[6 + k], none);
     };
 
 //// p2g
@@ -352,7 +301,7 @@
         int64_t* const flag = (int64_t*)faults.data + 3 * copy + (is_finite ? is_slow ? 2 : 1 : 0);
         if (!(is_finite && is_slow && is_inside) && here < *flag) *flag = here;
     };
-    Rows all, along_i, along_j;
+    Rows all = {}, along_i = {}, along_j = {};
     EACH_BLOCK {
         OPEN_BLOCK;
         prepare((const Real*)x.data + 3 * begin, used, copy);
@@ -371,10 +320,10 @@
             }
             *(Row*)all[l] = total, *(Row*)along_i[l] = total_i, *(Row*)along_j[l] = total_j;
         }
-        prefetch((Real*)C_after.data + 9 * (begin + 32), 9 * 16);
-        prefetch((Real*)F_trial.data + 9 * (begin + 32), 9 * 16);
-        prefetch((Real*)x_after.data + 3 * (begin + 32), 3 * 16);
-        prefetch((Real*)v_after.data + 3 * (begin + 32), 3 * 16);
+        Matrices::prefetch((Real*)C_after.data + 9 * (begin + 32), 9 * 16);
+        Matrices::prefetch((Real*)F_trial.data + 9 * (begin + 32), 9 * 16);
+        Matrices::prefetch((Real*)x_after.data + 3 * (begin + 32), 3 * 16);
+        Matrices::prefetch((Real*)v_after.data + 3 * (begin + 32), 3 * 16);
         Row v_p[4], place[3], moment[3][4], C_p[9];
         load_lanes((const Real*)x.data + 3 * begin, used, place);
         add_nodes(all, block.w[2], v_p);
@@ -413,7 +362,7 @@
 
 //// g2p_adjoint
     Real motions[16][16];  // u at the first node and columns of D, see `adjoint_kernels.g2p_adjoint`
-    Rows along_i, along_j, along_k;
+    Rows along_i = {}, along_j = {}, along_k = {};
     EACH_BLOCK {
         OPEN_BLOCK;
         prepare((const Real*)x.data + 3 * begin, used, copy);
@@ -421,6 +370,7 @@
         const Row none = {};
         {
             Row g[9], F_p[9], C_p[9], grad_F_p[9];
+            Matrices::prefetch((const Real*)F.data + 9 * (begin + 32), 9 * 16);
             load_lanes((const Real*)x_after.data + 3 * begin, used, place);
             load_lanes((const Real*)grad_x.data + 3 * begin, used, g_x);
             load_lanes((const Real*)grad_v.data + 3 * begin, used, g_v);
@@ -446,8 +396,8 @@
                 g_x[k] = HELD ? free ? moves : g_x[k] : moves;
             }
         }
-        store_four(motions[0], 16, g_v[0], g_v[1], g_v[2], none);
-        for (int k = 0; k < 3; ++k) store_four(motions[0] + 4 + 4 * k, 16, D[k], D[3 + k], D[6 + k], none);
+        Matrices::store_four(motions[0], 16, g_v[0], g_v[1], g_v[2], none);
+        for (int k = 0; k < 3; ++k) Matrices::store_four(motions[0] + 4 + 4 * k, 16, D[k], D[3 + k], D[6 + k], none);
         for (int l = 0; l < used; ++l) {
             if (HELD && ((const Real*)mass.data)[begin + l] == Real(0)) {
                 *(Row*)along_i[l] = *(Row*)along_j[l] = *(Row*)along_k[l] = none;
@@ -503,7 +453,7 @@
     }
 
 //// p2g_adjoint
-    Rows all, moment_i, moment_j, along_i, along_j, along_k;
+    Rows all = {}, moment_i = {}, moment_j = {}, along_i = {}, along_j = {}, along_k = {};
     EACH_BLOCK {
         OPEN_BLOCK;
         prepare((const Real*)x.data + 3 * begin, used, copy);
@@ -593,6 +543,7 @@
     }
 
 //// end
+    #undef LANE
     #undef SHUFFLE
     #undef INLINE
     #undef EACH_BLOCK

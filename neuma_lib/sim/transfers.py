@@ -18,6 +18,7 @@ import torch
 import warp as wp
 
 from neuma_lib.device import native_source, start_warp
+from neuma_lib.mechanics.singular_values_kernels import MATRICES
 from neuma_lib.sim.adjoint_kernels import adjoint_functions
 from neuma_lib.sim.clamp_kernels import clamp_functions, hold_type
 from neuma_lib.sim.contact_kernels import contact_functions, obstacle_type
@@ -26,6 +27,7 @@ from neuma_lib.sim.kernels import NO_CONTACT, forward_functions, grid_functions,
 start_warp()
 
 _TEXT = native_source(__file__, ".h")
+_TEXT["lanes"] = MATRICES + _TEXT["lanes"]
 
 
 def _native(dtype: torch.dtype, *parts: str, held: bool = False) -> str:
