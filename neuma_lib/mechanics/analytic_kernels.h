@@ -89,7 +89,7 @@
         for (int k = 0; k < 3; ++k) {
             c[k] = at_least(s[k], LOW);
             e[k] = logarithm(c[k]);
-            rate[k] = s[k] < LOW ? zero : one / c[k];
+            rate[k] = s[k] < LOW ? zero : RECIPROCAL(c[k]);
         }
         trace = e[0] + e[1] + e[2];
         for (int k = 0; k < 3; ++k) dev[k] = e[k] - trace * THIRD_PART;
@@ -120,7 +120,7 @@
         strains(s, limited, e, rate, trace, dev);
         const Pack mean = total * THIRD_PART;
         if (law == Tait) {  // c: 2 mu, K / 7
-            const Pack bounded = at_least(J, LOW), inverse = one / bounded;
+            const Pack bounded = at_least(J, LOW), inverse = RECIPROCAL(bounded);
             const Pack power = inverse * inverse * inverse * inverse * inverse * inverse;
             for (int k = 0; k < 3; ++k) y[k] = c[2] * (bounded - power) + c[1] * dev[k];
             if (!adjoint) return;
@@ -140,7 +140,7 @@
             for (int k = 0; k < 3; ++k) {
                 X[k] = exponential(half * dev[k]);
                 x[k] = X[k] * X[k];
-                inverse[k] = ogden ? zero : one / x[k];
+                inverse[k] = ogden ? zero : RECIPROCAL(x[k]);
                 y[k] = c[1] * x[k] - back * inverse[k];
             }
             const Pack middle = (y[0] + y[1] + y[2]) * THIRD_PART;
@@ -158,8 +158,8 @@
                 const int i = FIRST[k], j = SECOND[k];
                 const Pack product = X[i] * X[j];
                 Pack value, slope;
-                sinhc(half * (e[i] - e[j]), X[i] / X[j], value, slope);
-                quotient[k] = Real(2) * half * (c[1] * product + (ogden ? zero : back / product)) * value;
+                sinhc(half * (e[i] - e[j]), DIVIDE(X[i], X[j]), value, slope);
+                quotient[k] = Real(2) * half * (c[1] * product + (ogden ? zero : DIVIDE(zero + back, product))) * value;
             }
             const Pack weighted[3] = {h[0] * x[0], h[1] * x[1], h[2] * x[2]};
             grad_c[0] = weighted[0] + weighted[1] + weighted[2];
@@ -241,7 +241,7 @@
         } else if (law == NeoHookean) {
             const Pack bounded = at_least(J, LOW_J);
             for (int k = 0; k < 9; ++k) gb[k] = c[1] * A[k];
-            gJ = J < LOW_J ? zero : c[2] * total / bounded;
+            gJ = J < LOW_J ? zero : DIVIDE(c[2] * total, bounded);
             grad_c[0] = Real(0.5) * along - total;
             grad_c[1] = total * logarithm(bounded);
         } else {
@@ -304,7 +304,7 @@
         principal_stress(c, s, true, gy, y, quotient, gs, grad_c);
         for (int k = 0; k < 3; ++k) {
             const int i = FIRST[k], j = SECOND[k];
-            const Pack both = quotient[k] * (G[i][j] + G[j][i]) / away_from_zero(s[i] + s[j]);
+            const Pack both = DIVIDE(quotient[k] * (G[i][j] + G[j][i]), away_from_zero(s[i] + s[j]));
             K[k][k] = gs[k];
             K[i][j] = both * s[j];
             K[j][i] = both * s[i];
@@ -347,7 +347,7 @@
             const Pack minors[3] = {s[1] * s[2], s[0] * s[2], s[0] * s[1]};
             const Pack J = s[0] * minors[0], bounded = at_least(J, LOW_J);
             const Pack stretch = exponential(logarithm(bounded) * THIRD_PART);
-            const Pack slope = J < LOW_J ? zero : stretch * THIRD_PART / bounded;
+            const Pack slope = J < LOW_J ? zero : DIVIDE(stretch * THIRD_PART, bounded);
             yields = one == one;
             for (int k = 0; k < 3; ++k) {
                 y[k] = stretch;
@@ -358,7 +358,7 @@
             return true;
         }
         strains(s, limited, e, rate, trace, dev);
-        const Pack norm = SQRT(at_least(dot(dev, dev), NORMAL_MIN)), inverse = one / norm;
+        const Pack square = at_least(dot(dev, dev), NORMAL_MIN), inverse = RECIPROCAL_ROOT(square), norm = square * inverse;
         const auto undefined = norm != norm;
         // of a and b by the trace and the norm, and by the coefficients
         Pack a_trace = zero + THIRD_PART, a_norm = zero, b_trace = zero, b_norm = zero;
@@ -404,10 +404,10 @@
             const Pack p = -c[1] * trace, q = c[2] * norm;
             const Pack A = p * p + q * q, B = c[3] * p;
             yields = (A - B - B - c[4] > Real(0)) | undefined;
-            const Pack inverse_A = one / (yields ? A : one), root = SQRT(B * B + A * c[4]);
+            const Pack inverse_A = RECIPROCAL(yields ? A : one), root = SQRT(B * B + A * c[4]);
             const Pack ray = (B + root) * inverse_A, r = ray + (one - ray) * c[5];
-            const Pack r_ray = zero + (Real(1) - c[5]), r_A = r_ray * (Real(0.5) * c[4] / root - ray) * inverse_A;
-            const Pack r_B = r_ray * (one + B / root) * inverse_A;
+            const Pack r_ray = zero + (Real(1) - c[5]), r_A = r_ray * (DIVIDE(zero + Real(0.5) * c[4], root) - ray) * inverse_A;
+            const Pack r_B = r_ray * (one + DIVIDE(B, root)) * inverse_A;
             b = r;
             a = r * a;
             b_trace = -c[1] * (Real(2) * r_A * p + r_B * c[3]);
@@ -415,7 +415,7 @@
             b_c[0] = -trace * (Real(2) * r_A * p + r_B * c[3]);
             b_c[1] = norm * Real(2) * r_A * q;
             b_c[2] = r_B * p;
-            b_c[3] = r_ray * Real(0.5) / root;
+            b_c[3] = DIVIDE(r_ray * Real(0.5), root);
             b_c[4] = one - ray;
             a_trace = r * THIRD_PART + b_trace * trace * THIRD_PART;
             a_norm = b_norm * trace * THIRD_PART;
@@ -430,14 +430,14 @@
                 Pack u = other < log_all ? other : log_all, share = zero, slope = one;
                 for (int step = 0; step < 9; ++step) {  // Newton's method, see plasticity._positive_root
                     const Pack d = c[2] + (c[3] - Real(1)) * u, size = d < Real(0) ? -d : d, small = exponential(-size);
-                    share = (d < Real(0) ? small : one) / (one + small);
-                    slope = one / (one + (c[3] - Real(1)) * share);
+                    share = DIVIDE(d < Real(0) ? small : one, one + small);
+                    slope = RECIPROCAL(one + (c[3] - Real(1)) * share);
                     const Pack sum = (d < Real(0) ? u : u + d) + logarithm(one + small);
                     u = u - (sum - log_all) * slope;
                 }
                 const Pack root = exponential(u);
                 kept = c[1] + root;
-                kept_norm = tiny ? zero : root * slope / all;
+                kept_norm = tiny ? zero : DIVIDE(root * slope, all);
                 kept_limit = one - kept_norm;
                 b_c[1] = -root * share * slope * inverse;
                 b_c[2] = b_c[1] * u;
@@ -468,7 +468,7 @@
             gs[k] = rate[k] * (g_trace + b * gl[k] + g_norm * dev[k]);
             const int i = FIRST[k], j = SECOND[k];
             Pack value, slope;
-            sinhc(Real(0.5) * b * (e[i] - e[j]), Y[i] / Y[j], value, slope);
+            sinhc(Real(0.5) * b * (e[i] - e[j]), DIVIDE(Y[i], Y[j]), value, slope);
             quotient[k] = quotient[k] * b * Y[i] * Y[j] * value;
         }
         for (int k = 0; k < 5; ++k) grad_c[k] = yields ? ga * a_c[k] + gb * b_c[k] : zero;
@@ -499,7 +499,7 @@
         for (int k = 0; k < 3; ++k) {
             const int i = FIRST[k], j = SECOND[k];
             const Pack stretch = Real(0.5) * quotient[k] * (G[i][j] + G[j][i]);
-            const Pack spin = Real(0.5) * (y[i] + y[j]) / away_from_zero(s[i] + s[j]) * (G[i][j] - G[j][i]);
+            const Pack spin = DIVIDE(Real(0.5) * (y[i] + y[j]), away_from_zero(s[i] + s[j])) * (G[i][j] - G[j][i]);
             K[k][k] = gs[k];
             K[i][j] = stretch + spin;
             K[j][i] = stretch - spin;
@@ -572,14 +572,13 @@
 // processes one row.
 //// rows
     auto load = [&](uint64_t array, size_t first, int used, Pack* x) {
-        const Real* const p = (const Real*)array + 9 * first;
-        for (int l = 0; l < WIDTH; ++l)
-            for (int k = 0; k < 9; ++k) LANE(x[k], l) = p[9 * (l < used ? l : 0) + k];
+        Matrices::load((const Real*)array + 9 * first, used, x);
+    };
+    auto prefetch = [&](uint64_t array, size_t first) {
+        Matrices::prefetch((const Real*)array + 9 * (first + WIDTH), 9 * WIDTH);
     };
     auto store = [&](uint64_t array, size_t first, int used, const Pack* x) {
-        Real* const p = (Real*)array + 9 * first;
-        for (int l = 0; l < used; ++l)
-            for (int k = 0; k < 9; ++k) p[9 * l + k] = LANE(x[k], l);
+        Matrices::store((Real*)array + 9 * first, used, x);
     };
     auto add_up = [&](uint64_t partials, size_t pack, int used, const Pack* grad_c) {
         if (!partials) return;
@@ -604,9 +603,11 @@
         const Real* const c = (const Real*)rows + (COEFFICIENTS + 1) * copy;
         Pack* const kept = cache ? (Pack*)cache + KEPT * pack : nullptr;
         Pack x[9], value[9];
+        if (cache) Matrices::prefetch((Real*)(kept + KEPT), KEPT * WIDTH);
         load(F, first, used, x);
 
 //// evaluate
+        prefetch(out, first);
         FORWARD(c, x, value, kept);
         store(out, first, used, value);
     }
@@ -622,6 +623,8 @@
 // `rows` are those of the plasticity and F is F_trial.
 //// evaluate_flow
         Pack tau[9];
+        prefetch(out, first);
+        prefetch(stress_out, first);
         flow(c, (const Real*)elastic_rows + (COEFFICIENTS + 1) * copy, x, value, tau, kept);
         store(out, first, used, value);
         store(stress_out, first, used, tau);

@@ -53,6 +53,8 @@
     #define LANE(x, l) (x)
     // two units in the last place suffice for products of 11 bits
     #define SQRT(x) (HALF ? root(x) : sqrtf(x))
+    #define RECIPROCAL(x) DIVIDE(1.0f, x)
+    #define RECIPROCAL_ROOT(x) DIVIDE(1.0f, SQRT(x))
     #define DIVIDE(x, y) (HALF ? __fdividef(x, y) : (x) / (y))
     const int g = lane >> 2, t = lane & 3;
     // Row of this thread in the warp and in the block. If a warp has 16 rows, both of its halves compute the same rows.
@@ -736,6 +738,8 @@
 //// end
     #undef LANE
     #undef SQRT
+    #undef RECIPROCAL
+    #undef RECIPROCAL_ROOT
     #undef DIVIDE
     #undef NN
     #undef NT

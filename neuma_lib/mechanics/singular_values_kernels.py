@@ -21,9 +21,10 @@ CPU_WIDTH = {torch.float32: 16, torch.float64: 8}
 SWEEPS = {torch.float32: 3, torch.float64: 4}
 """Cyclic Jacobi sweeps that reduce the off-diagonal of A^T A to round-off (quadratic convergence from the second)."""
 _PARTS = native_source(__file__, ".h")
-TYPES, FUSE, MATH, LOAD, SVD, STORE, END = (
-    _PARTS[name] for name in ("types", "fuse", "math", "load", "svd", "store", "end")
+FUSE, MATH, MATRICES, LOAD, SVD, STORE, END = (
+    _PARTS[name] for name in ("fuse", "math", "matrices", "load", "svd", "store", "end")
 )
+TYPES = _PARTS["types"] + MATRICES
 
 
 def snippet(*parts: str, dtype: torch.dtype) -> str:

@@ -10,23 +10,11 @@
     #define READ_AGAIN
 #endif
     const Real BEND_MAX = sizeof(Real) == 4 ? Real(1e37) : Real(1e300);
-#if defined(__CUDA_ARCH__)
-    auto reciprocal_root = [](const Pack& x) { return Real(1) / SQRT(x); };
-#else
-    // By Newton's method, in a third of the time of a root and a quotient. The first value has an error of 3.5 %.
-    auto reciprocal_root = [&](const Pack& x) {
-        const int STEPS = sizeof(Real) == 4 ? 3 : 4;
-        const Bits MAGIC = (Bits)(zero + (sizeof(Real) == 4 ? Real(1.3211836172961055e19) : Real(9.603007803048109e153)));
-        Pack r = (Pack)(MAGIC - ((Bits)x >> 1));
-        for (int i = 0; i < STEPS; ++i) r = r * (Real(1.5) - Real(0.5) * x * r * r);
-        return r;
-    };
-#endif
     // activation x / sqrt(1 + x^2), with r = 1 / sqrt(1 + x^2) and slope r^3
     auto bend = [&](auto& x, auto& r) {
         UNROLL for (int k = 0; k < (int)(sizeof(x) / sizeof(x[0])); ++k) {
             const Pack square = x[k] * x[k] + Real(1);
-            r[k] = reciprocal_root(square > BEND_MAX ? zero + BEND_MAX : square);
+            r[k] = RECIPROCAL_ROOT(square > BEND_MAX ? zero + BEND_MAX : square);
             x[k] = x[k] * r[k];
         }
     };
@@ -80,28 +68,28 @@
         const int used = n - first < WIDTH ? n - first : WIDTH;
 #endif
 
-// u[k], v[k] and s[k], from the cache if it has them.
+// u[k], v[k] and s[k]. They are written to the cache if `cached` is 1 and read from it if it is 2. If it is 3, s[k] are the
+// stretches after the return map that has written them, because it keeps u and v.
 //// decompose
         Pack u[3][3], v[3][3], s[3];
         auto kept = [&](int k) -> Pack& {
             const int place = first / CACHED_WIDTH;
             return *(Pack*)((Real*)cache + (CACHED * place + k) * (size_t)CACHED_WIDTH + first % CACHED_WIDTH);
         };
-        if (cached == 2) {
+        if (cached && first % CACHED_WIDTH == 0)
+            Matrices::prefetch((Real*)cache + CACHED * (size_t)(first / CACHED_WIDTH + 1) * CACHED_WIDTH, CACHED * CACHED_WIDTH);
+        if (cached > 1) {
             for (int k = 0; k < 3; ++k) {
                 for (int i = 0; i < 3; ++i) {
                     u[k][i] = kept(3 * k + i);
                     v[k][i] = kept(9 + 3 * k + i);
                 }
-                s[k] = kept(18 + k);
+                s[k] = kept((cached == 2 ? 18 : 21) + k);
             }
         } else {
             Pack* const singular = s;
             Pack a[9];
-            for (int l = 0; l < WIDTH; ++l) {
-                const Real* p = (const Real*)F + 9 * (size_t)(first + (l < used ? l : 0));
-                for (int k = 0; k < 9; ++k) LANE(a[k], l) = p[k];
-            }
+            Matrices::load((const Real*)F + 9 * (size_t)first, used, a);
             {SVD}
             for (int k = 0; k < 3; ++k) {
                 u[0][k] = u0[k];
@@ -129,15 +117,15 @@
             const auto inside = s[k] >= STRETCH_MIN;
             c[k] = inside ? s[k] : zero + STRETCH_MIN;
             e[k] = logarithm(c[k]);
-            rate[k] = inside ? one / c[k] : zero;
+            rate[k] = inside ? RECIPROCAL(c[k]) : zero;
         }
         const bool crushed = any(s[2] < STRETCH_MIN);
         const Pack trace = e[0] + e[1] + e[2];
         for (int k = 0; k < 3; ++k) dev[k] = e[k] - trace * THIRD_PART;
-        const Pack square = dot(dev, dev), rounded = square + SMOOTH * SMOOTH, root = SQRT(rounded);
+        const Pack square = dot(dev, dev), rounded = square + SMOOTH * SMOOTH, inverse_root = RECIPROCAL_ROOT(rounded);
         const Pack det = dev[0] * dev[1] * dev[2];
-        const Pack inverse_root = one / root, inverse = inverse_root * inverse_root;
-        Pack x[3] = {trace, square / (root + SMOOTH), LODE * det * inverse};
+        const Pack root = rounded * inverse_root, inverse = inverse_root * inverse_root;
+        Pack x[3] = {trace, DIVIDE(square, root + SMOOTH), LODE * det * inverse};
         for (int k = 0; k < 3; ++k) x[k] = x[k] * (Real(1) / STRAIN);
         Pack h0[HIDDEN], r0[HIDDEN], h1[HIDDEN], r1[HIDDEN], change[OUTPUTS], r2[OUTPUTS];
         layer(w0, x, h0, Real(1));
@@ -184,11 +172,11 @@
                 for (int k = 0; k < 3; ++k) total = total + (s[k] - Real(1)) * (s[k] + Real(1));
                 mean = mu * THIRD_PART * total + lam * logarithm(bounded);
                 for (int k = 0; k < 3; ++k)
-                    mean_slope[k] = Real(2) * mu * THIRD_PART * s[k] + (inside ? lam * minors[k] / bounded : zero);
+                    mean_slope[k] = Real(2) * mu * THIRD_PART * s[k] + (inside ? DIVIDE(lam * minors[k], bounded) : zero);
             }
         }
         const Pack factor = exponential(change[0]), modulus = Real(2) * mu * exponential(change[1]);
-        const Pack growth = exponential(change[2]), inverse_growth = one / (growth + Real(3));
+        const Pack growth = exponential(change[2]), inverse_growth = RECIPROCAL(growth + Real(3));
         const Pack shift = Real(3) * (growth - Real(1)) * inverse_growth;
         Pack shear[3] = {zero, zero, zero}, slope[3] = {zero, zero, zero}, twist[3] = {zero, zero, zero};
         Pack quotient[3] = {zero, zero, zero};
@@ -208,7 +196,7 @@
             for (int pair = 0; pair < 3; ++pair) {
                 const int i = FIRST[pair], j = SECOND[pair];
                 Pack value, derivative;
-                sinhc(h[i] - h[j], X[i] / X[j], value, derivative);
+                sinhc(h[i] - h[j], DIVIDE(X[i], X[j]), value, derivative);
                 quotient[pair] = quotient[pair] + weight * X[i] * X[j] * value * log_quotient[pair];
             }
             if (crushed && power > Real(0)) {
@@ -290,7 +278,7 @@
                 psi[0] = Real(0.5) * lam * log_J * log_J;
                 psi[1] = -mu * log_J;
                 for (int k = 0; k < 3; ++k) {
-                    const Pack log_slope = inside ? minors[k] / bounded : zero;
+                    const Pack log_slope = inside ? DIVIDE(minors[k], bounded) : zero;
                     const Pack strain = Real(0.5) * (s[k] - Real(1)) * (s[k] + Real(1));
                     psi[1] = psi[1] + mu * strain;
                     stress[0][k] = lam * log_J;
@@ -489,8 +477,9 @@
         dilation = dilation * (Real(1) / LIMIT);
         compaction = compaction * (Real(1) / LIMIT);
         const Pack tiny = zero + NORMAL_MIN;
-        const Pack norm = SQRT(square > NORMAL_MIN ? square : tiny), inverse_norm = one / norm;
-        const Pack fluid = one / (one + value[2]), dilatancy = dilation * associated * value[1];
+        const Pack bounded = square > NORMAL_MIN ? square : tiny;
+        const Pack inverse_norm = RECIPROCAL_ROOT(bounded), norm = bounded * inverse_norm;
+        const Pack fluid = RECIPROCAL(one + value[2]), dilatancy = dilation * associated * value[1];
         const Pack relaxed = trace * (one - fluid * crush);
         const Pack shifted = kind == GRANULAR ? relaxed - Real(3) * value[0] : relaxed;
         const Pack pressure = kind == GRANULAR ? -shifted : shifted < Real(0) ? -shifted : zero;
@@ -500,7 +489,7 @@
         const auto slips = (norm > limit) & (beyond_apex <= Real(0));
         const auto changed = torn | slips | (crush > Real(0));
         const bool moves = any(changed);
-        const Pack held = one / (one + value[1] * dilatancy), slip = one - limit * inverse_norm;
+        const Pack held = RECIPROCAL(one + value[1] * dilatancy), slip = one - limit * inverse_norm;
         const Pack share = slips ? fluid * held * slip : zero;
         Pack y[3];
         for (int k = 0; k < 3; ++k) y[k] = s[k];
@@ -515,16 +504,16 @@
 
 //// deformation
         {
+            for (int k = 0; k < (cached == 1 ? 3 : 0); ++k) kept(21 + k) = y[k];
             Pack f[9];
+            Matrices::load((const Real*)F + 9 * (size_t)first, used, f);
             for (int i = 0; i < 3; ++i)
-                for (int j = 0; j < 3; ++j)
-                    f[3 * i + j] = y[0] * u[0][i] * v[0][j] + y[1] * u[1][i] * v[1][j] + y[2] * u[2][i] * v[2][j];
-            for (int l = 0; l < used; ++l) {
-                const Real* from = (const Real*)F + 9 * (size_t)(first + l);
-                Real* to = (Real*)out + 9 * (size_t)(first + l);
-                const bool moved = LANE(changed, l);
-                for (int k = 0; k < 9; ++k) to[k] = moved ? LANE(f[k], l) : from[k];
-            }
+                for (int j = 0; j < 3; ++j) {
+                    const Pack moved = y[0] * u[0][i] * v[0][j] + y[1] * u[1][i] * v[1][j] + y[2] * u[2][i] * v[2][j];
+                    f[3 * i + j] = changed ? moved : f[3 * i + j];
+                }
+            Matrices::prefetch((Real*)out + 9 * (size_t)(first + 2 * WIDTH), 9 * WIDTH);
+            Matrices::store((Real*)out + 9 * (size_t)first, used, f);
         }
 
 // K of grad_F = U K V^T with G = U^T g V, unless no row of the pack yields.
@@ -574,29 +563,25 @@
                 Pack product = y[i] * y[j];
                 product = product > Real(0) ? product : zero;
                 const Pack stretch = Real(0.5) * SQRT(product) * scale * middle * log_quotient[pair];
-                const Pack turn = Real(0.5) * (y[i] + y[j]) / sum;
+                const Pack turn = DIVIDE(Real(0.5) * (y[i] + y[j]), sum);
                 K[i][j] = stretch * (G[i][j] + G[j][i]) + turn * (G[i][j] - G[j][i]);
                 K[j][i] = stretch * (G[i][j] + G[j][i]) - turn * (G[i][j] - G[j][i]);
             }
         }
 
 //// stress
+        Pack tau[9];
         for (int i = 0; i < 3; ++i)
-            for (int j = 0; j <= i; ++j) {
-                const Pack tau = y[0] * u[0][i] * u[0][j] + y[1] * u[1][i] * u[1][j] + y[2] * u[2][i] * u[2][j];
-                for (int l = 0; l < used; ++l) {
-                    Real* p = (Real*)out + 9 * (size_t)(first + l);
-                    p[3 * i + j] = p[3 * j + i] = LANE(tau, l);
-                }
-            }
+            for (int j = 0; j <= i; ++j)
+                tau[3 * i + j] = tau[3 * j + i]
+                    = y[0] * u[0][i] * u[0][j] + y[1] * u[1][i] * u[1][j] + y[2] * u[2][i] * u[2][j];
+        Matrices::prefetch((Real*)out + 9 * (size_t)(first + 2 * WIDTH), 9 * WIDTH);
+        Matrices::store((Real*)out + 9 * (size_t)first, used, tau);
 
 // The gradient g of the result.
 //// load_gradient
         Pack g[9];
-        for (int l = 0; l < WIDTH; ++l) {
-            const Real* p = (const Real*)grad_out + 9 * (size_t)(first + (l < used ? l : 0));
-            for (int k = 0; k < 9; ++k) LANE(g[k], l) = l < used ? p[k] : Real(0);
-        }
+        Matrices::load((const Real*)grad_out + 9 * (size_t)first, used, g, false);
 
 // gy, and off = G + G^T by pairs for G = U^T g U
 //// stress_gradient
@@ -621,7 +606,7 @@
             const int i = FIRST[pair], j = SECOND[pair];
             Pack total = s[i] + s[j];
             total = total < Real(0) ? (total < -EPS ? total : zero - EPS) : (total > EPS ? total : zero + EPS);
-            const Pack both = quotient[pair] * off[pair] / total;
+            const Pack both = DIVIDE(quotient[pair] * off[pair], total);
             K[i][j] = both * s[j];
             K[j][i] = both * s[i];
         }
@@ -652,10 +637,12 @@
         const Pack gy[3] = {zero, zero, zero};
 
 //// store_gradient
-        for (int l = 0; l < used; ++l) {
-            Real* p = (Real*)grad_F + 9 * (size_t)(first + l);
-            for (int k = 0; k < 9; ++k) p[k] = LANE(g[k], l);
+        if (adds) {
+            Pack before[9];
+            Matrices::load((const Real*)grad_F + 9 * (size_t)first, used, before);
+            for (int k = 0; k < 9; ++k) g[k] = g[k] + before[k];
         }
+        Matrices::store((Real*)grad_F + 9 * (size_t)first, used, g);
 
 //// end_rows
     }

@@ -49,8 +49,8 @@ KINDS = {"stretch": 3, "energy": 2, "return": 5}
 """Number of network outputs by kind of kernel: the two forms of elasticity, and plasticity."""
 BASES = ("hencky", "neo_hookean", "fixed_corotated")
 """Bases of elasticity in the order of their indices in the kernels."""
-CACHED = 21
-"""Numbers per row that a CPU caches: U, V and the singular values."""
+CACHED = 24
+"""Numbers per row that a CPU caches: U, V, the singular values, and those after a return map."""
 EVALUATE_WIDTH = {torch.float32: 32, torch.float64: 16}
 """Rows in a pack of the forward kernel on a CPU: two registers hide the latency of roots and quotients. The sums of the
 backward kernel would not fit into the first cache."""
@@ -141,7 +141,8 @@ def add_source(kind: str, dtype: torch.dtype) -> str:
 def evaluate_kernel(kind: str, dtype: torch.dtype):
     """Kernel (F, W0, W1, W2, index of the base, four constants, n, cached, cache, out), launched by `launch_blocks`.
 
-    If ``cached`` is 1, it writes the SVD to the cache (packs, CACHED, EVALUATE_WIDTH).
+    If ``cached`` is 1, it writes the SVD to the cache (packs, CACHED, EVALUATE_WIDTH). If it is 3, F is the result of
+    the return map that has written the cache.
     """
     real, _, _ = warp_types(dtype)
 
@@ -163,28 +164,29 @@ def evaluate_kernel(kind: str, dtype: torch.dtype):
 
 @cache
 def vjp_kernel(kind: str, dtype: torch.dtype):
-    """Kernel (F, W0, W1, W2, index of the base, four constants, n, cached, cache, grad_out, grad_F, ...).
+    """Kernel (F, W0, W1, W2, index of the base, four constants, n, cached, cache, adds, grad_out, grad_F, ...).
 
-    If ``cached`` is 2, it reads the SVD from the cache. It adds the gradients of the weights to three totals on a CPU,
-    and writes them to partials (blocks, weights) on a GPU.
+    If ``cached`` is 2 or 3, it reads the SVD from the cache. If ``adds`` is 1, it adds to grad_F. It adds the gradients
+    of the weights to three totals on a CPU, and writes them to partials (blocks, weights) on a GPU.
     """
     real, _, _ = warp_types(dtype)
 
     @wp.func_native(source(kind, True, dtype))
     def vjp_rows(
         F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, kind: int, p0: real, p1: real, p2: real, p3: real,
-        n: int, cached: int, cache: wp.uint64, grad_out: wp.uint64, grad_F: wp.uint64,
+        n: int, cached: int, cache: wp.uint64, adds: int, grad_out: wp.uint64, grad_F: wp.uint64,
         total0: wp.uint64, total1: wp.uint64, total2: wp.uint64, partials: wp.uint64,
     ): ...  # fmt: skip
 
     @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
     def structured_vjp(
         F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, kind: int, p0: real, p1: real, p2: real, p3: real,
-        n: int, cached: int, cache: wp.uint64, grad_out: wp.uint64, grad_F: wp.uint64,
+        n: int, cached: int, cache: wp.uint64, adds: int, grad_out: wp.uint64, grad_F: wp.uint64,
         total0: wp.uint64, total1: wp.uint64, total2: wp.uint64, partials: wp.uint64,
     ):  # fmt: skip
         vjp_rows(
-            F, W0, W1, W2, kind, p0, p1, p2, p3, n, cached, cache, grad_out, grad_F, total0, total1, total2, partials
+            F, W0, W1, W2, kind, p0, p1, p2, p3, n, cached, cache, adds, grad_out, grad_F,
+            total0, total1, total2, partials,
         )  # fmt: skip
 
     return structured_vjp
@@ -272,8 +274,8 @@ def vjp(
             W, blocks = [w.detach().contiguous() for w in weights], _blocks(F)
             partials = None if F.device.type == "cpu" else F.new_empty(blocks, weight_count(kind))
             cached = 0 if cache is None else 2
-            inputs = (*W, constants.kind, *constants.values, len(F), cached, cache, grad_out, result, *sums)
-            launch_blocks(vjp_kernel(kind, F.dtype), blocks, THREADS[F.dtype], F, *inputs, partials)
+            inputs = *W, constants.kind, *constants.values, len(F), cached, cache, 0, grad_out, result
+            launch_blocks(vjp_kernel(kind, F.dtype), blocks, THREADS[F.dtype], F, *inputs, *sums, partials)
             if partials is not None:
                 columns = -(-weight_count(kind) // LANES)
                 launch_blocks(add_kernel(kind, F.dtype), columns, LANES * GROUPS, partials, blocks, *sums)

@@ -26,6 +26,7 @@ class NativeTransfers:
     Attributes:
         grids: momentum and mass, velocity, and gradient of the nodes, shape (2 or 3, nodes + PADDING, 4).
         to_grid: from tau and the state to the velocities of the nodes.
+        to_grid_again: the same in the reverse loop.
         to_particles: from these to the state after the step. F_trial is the F of that state if the key is True.
         to_trial: recomputes F_trial.
         adjoint: from gradients of the state after the step and of F_trial, with the same keys, to those of the state
@@ -40,6 +41,9 @@ class NativeTransfers:
         self._deformation = deformation_kernels(size.dtype)
         self.grids = ws.buffer((2 + size.differentiable, size.copies * model.nodes**3 + PADDING), "vec4")
         self.spans = ws.buffer((size.copies * 6 * model.nodes**2,), dtype=torch.int32)
+        kept = size.n_cached_steps if self._keeps_nodes else 1
+        self.kept = ws.buffer((kept, size.particles if self._keeps_nodes else 0), "vec4")
+        self.kept_spans = ws.buffer((kept, 2 * size.copies * model.nodes**2 + 1), dtype=torch.int32)
         self.mass_now, self.vol_now, self.radius_now = ws.mass, ws.vol0, ws.radius
         if model.clamps:
             self.mass_now, self.vol_now, self.radius_now = (
@@ -50,16 +54,28 @@ class NativeTransfers:
         self.near = ws.buffer((touching,), dtype=torch.int32)
         self.touching = ws.buffer((1,), dtype=torch.int32)
 
+    @property
+    def _keeps_nodes(self) -> bool:
+        """Whether the nodes of all steps of a segment are kept."""
+        size = self._ws.size
+        return size.differentiable and size.n_cached_steps == size.n_states - 1
+
     def record_forward(self) -> None:
         """Record the launches of a step."""
         k, N = self._kernels, self._ws.size.particles
-        self.to_grid = [self._launch(k.hold, N)] if "clamps" in self._ws.features else []
-        self.to_grid += [self._launch(k.touch)] if "contact" in self._ws.features else []
-        self.to_grid += [self._launch(k.p2g), self._launch(k.grid_update)]
+        hold = [self._launch(k.hold, N)] if "clamps" in self._ws.features else []
+
+        def to_grid(again: int) -> list[Repeated]:
+            touch = [self._launch(k.touch, again=again)] if "contact" in self._ws.features else []
+            p2g = self._launch(k.p2g, again=again and int(self._keeps_nodes))
+            return [*hold, *touch, p2g, self._launch(k.grid_update)]
+
+        self.to_grid, self.to_grid_again = to_grid(0), to_grid(1)
         self.to_trial = [self._launch(k.trial_deformation)]
         self.to_particles = {elastic: self._moves(elastic) for elastic in (False, True)}
         self._steps = {
             "to_grid": LaunchSequence(self.to_grid),
+            "to_grid_again": LaunchSequence(self.to_grid_again),
             "to_particles": LaunchSequence(self.to_particles[False]),
             "to_trial": LaunchSequence(self.to_trial),
         }
@@ -109,7 +125,7 @@ class NativeTransfers:
         launches += [self._launch(k.touch_adjoint)] if "contact" in ws.features else []
         return launches
 
-    def _launch(self, kernel: wp.Kernel, dim: int = 1, **others: Tensor | str) -> Repeated:
+    def _launch(self, kernel: wp.Kernel, dim: int = 1, **others: Tensor | str | int) -> Repeated:
         """A launch whose arguments after the constants are indices or buffers by name, or those of ``others``."""
         indices, arguments = {}, []
         for position, label in enumerate(arg.label for arg in kernel.adj.args):

@@ -6,6 +6,7 @@ Other laws run in Python between the transfers, step by step (`Simulation.step`)
 from __future__ import annotations
 
 import math
+import weakref
 from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any
@@ -26,11 +27,31 @@ Parts = Mapping[str, Sequence[tuple[Constitutive, slice, Weights]]]
 """For elasticity and plasticity: law, particles and weights of each region."""
 
 
+def segment_loop(
+    ws: Workspace, parts: Parts, caches_steps: bool, cache_bytes: float, tracers: Repeated | None = None
+) -> SegmentLoop:
+    """A `SegmentLoop` for these arguments, that of the last rollout in the workspace if it has the same ones."""
+    kernels = [
+        (kernel, here.start, here.stop, *(_number(value) for value in given.values()), *map(_number, weights))
+        for regions in parts.values()
+        for law, here, weights in regions
+        for kernel, given in [law.kernel(ws.F[0][here], weights, False)]
+    ]
+    key = kernels, caches_steps, cache_bytes, PARTICLE_STEPS
+    if tracers is not None:
+        return SegmentLoop(ws, parts, caches_steps, cache_bytes, tracers)
+    if ws.loop is None or ws.loop[0] != key:
+        ws.loop = key, SegmentLoop(weakref.proxy(ws), parts, caches_steps, cache_bytes)
+    loop = ws.loop[1]
+    loop.clear_sums()
+    return loop
+
+
 class SegmentLoop:
     """Forward and reverse loops over the steps of a segment.
 
-    If all laws are analytic and a region has a return map, the stress of a step is computed at the end of the previous
-    one, because both need the same singular vectors. Only the first stress of a simulation is computed from F alone.
+    If a region has a return map, the stress of a step is computed at the end of the previous one, because both need the
+    same singular vectors. Only the first stress of a simulation is computed from F alone.
     For the same bytes, a segment is therefore recomputed from the F_trial before its first F.
 
     Args:
@@ -52,20 +73,23 @@ class SegmentLoop:
         self._ws, self._parts, self._caches_steps = ws, parts, caches_steps
         self._regions = range(len(parts["elasticity"]))
         self._elastic = all(law.identity for law, _, _ in parts["plasticity"])
-        analytic = all(law.native_rows for regions in parts.values() for law, _, _ in regions)
-        self._flowing = analytic and not self._elastic
-        self._memory: list[Tensor] = []  # of arguments of the kernels
-        self._caches = self._new_caches(cache_bytes) if ws.size.differentiable else {}
+        self._flowing = not self._elastic
+        self._memory: list[Any] = []  # arguments of the kernels
+        self._caches = self._new_caches(cache_bytes)
         self._per_call = max(1, PARTICLE_STEPS // ws.size.particles)
         self._partials: dict[tuple[str, int], Tensor] = {}  # of analytic laws in the steps of a call
         self._sums: dict[tuple[str, int], Weights] = {}  # gradients of rows of coefficients, or of weights
         last = [] if tracers is None else [tracers]
         before, flow = ([], self._flows()) if self._flowing else (self._stresses(), [])
-        after = flow if self._flowing or self._elastic else self._returns()
         moves = ws.native.to_particles[self._elastic]
-        self._forward = LaunchSequence([*before, *ws.native.to_grid, *moves, *after, *last])
+        self._forward = LaunchSequence([*before, *ws.native.to_grid, *moves, *flow, *last])
         self._stress, self._flow = LaunchSequence(self._stresses()), LaunchSequence(flow)
         self._reverse: LaunchSequence | None = None
+
+    def clear_sums(self) -> None:
+        """Clear gradients of the weights that an interrupted reverse loop has left."""
+        for own in (*self._partials.values(), *(own for sums in self._sums.values() for own in sums)):
+            own.zero_()
 
     def start(self, steps: int | None) -> None:
         """Set the first stress of a segment after one of some steps, or the first of the simulation."""
@@ -151,13 +175,10 @@ class SegmentLoop:
                 elif weights:
                     self._sums[part, k] = tuple(torch.zeros_like(w) for w in weights)
         stresses = [*self._stress_adjoints(), ws.native.add_elastic]
-        transfers = [*ws.native.to_grid, *ws.native.adjoint[self._elastic]]
+        transfers = [*ws.native.to_grid_again, *ws.native.adjoint[self._elastic]]
         if not self._flowing:
-            again = [*self._stresses(), *(() if self._elastic else ws.native.to_trial)]
-            returns = [] if self._elastic else self._return_adjoints()
-            to_grid, adjoint = ws.native.to_grid, ws.native.adjoint[self._elastic]
-            again = [] if self._caches_steps else again
-            self._reverse = LaunchSequence([*again, *to_grid, *returns, *adjoint, *stresses])
+            again = [] if self._caches_steps else self._stresses()
+            self._reverse = LaunchSequence([*again, *transfers, *stresses])
             return
         flows, trial = self._flow_adjoints(), [one.earlier() for one in ws.native.to_trial]
         again = [] if self._caches_steps else [*trial, *self._flows(earlier=True)]
@@ -172,88 +193,114 @@ class SegmentLoop:
         A return map and the stress after it at once use that of the return map.
         """
         ws, caches = self._ws, {}
-        for part, regions in self._parts.items():
-            for k, (law, here, weights) in enumerate(regions):
-                keeps = law.keeps_singular_values
-                if self._flowing:
-                    keeps = part == "plasticity" and (
-                        keeps or self._parts["elasticity"][k][0].keeps_singular_values
-                    )
-                elif part == "plasticity" and not self._caches_steps:
-                    keeps = False
-                if not keeps:
-                    continue
-                shape = (ws.size.n_cached_steps, *law.cache_shape(ws.F[0][here], weights))
-                cache_bytes -= math.prod(shape) * ws.F.element_size() if self._caches_steps else 0
-                if cache_bytes >= 0:
-                    key = "segment", part, k, shape
-                    if key not in ws.law_caches:
-                        ws.law_caches[key] = ws.F.new_empty(shape)
-                    caches[part, k] = ws.law_caches[key]
+        for k in self._regions:
+            elastic, plastic = (self._parts[part][k][0] for part in ("elasticity", "plasticity"))
+            part = "elasticity" if not self._flowing or self._is_separate(k) else "plasticity"
+            law, here, weights = self._parts[part][k]
+            keeps = ws.size.differentiable and (
+                elastic.keeps_singular_values or part == "plasticity" and plastic.keeps_singular_values
+            )
+            shared = part == "plasticity" and not self._is_analytic(k)
+            if not keeps and not shared:
+                continue
+            one = law.cache_shape(ws.F[0][here], weights)
+            shape = (ws.size.n_cached_steps, *one)
+            needed = math.prod(shape) * ws.F.element_size() if self._caches_steps else 0
+            if needed > cache_bytes and shared:
+                shape, needed = (1, *one), 0
+            if needed <= cache_bytes:
+                cache_bytes -= needed
+                key = "segment", part, k, shape
+                if key not in ws.law_caches:
+                    ws.law_caches[key] = ws.F.new_empty(shape)
+                caches[part, k] = ws.law_caches[key]
         return caches
 
     def _stresses(self) -> list[Repeated]:
         return self._each("elasticity", False, F=(self._ws.F, "now"), out=(self._ws.tau, "stressed"))
-
-    def _returns(self) -> list[Repeated]:
-        return self._each("plasticity", False, F=(self._ws.F_trial, "cached"), out=(self._ws.F, "after"))
 
     def _stress_adjoints(self) -> list[Repeated]:
         ws = self._ws
         grads = dict(grad_out=(ws.grad_tau, None), grad_F=(ws.grad_F_elastic, None))
         return self._each("elasticity", True, F=(ws.F, "now"), **grads)
 
-    def _return_adjoints(self) -> list[Repeated]:
-        ws = self._ws
-        grads = dict(grad_out=(ws.grad_F, None), grad_F=(ws.grad_F_trial, None))
-        return self._each("plasticity", True, F=(ws.F_trial, "cached"), **grads)
-
     def _each(self, part: str, backward: bool, **values: tuple[Tensor, str | None]) -> list[Repeated]:
-        """Launches of the kernels of all regions, see `_launch`."""
-        launches = []
-        for k, (law, here, weights) in enumerate(self._parts[part]):
-            kernel, given = law.kernel(self._ws.F[0][here], weights, backward)
-            by_step = {"partials": self._partials.get((part, k))} if backward else {}
-            if backward and not law.native_rows:
-                given |= {f"total{i}": own for i, own in enumerate(self._sums.get((part, k), ()))}
-            cache = self._caches.get((part, k))
-            if cache is not None and not law.native_rows:
-                given["cached"] = 2 if backward else 1
-            launches.append(self._launch(kernel, here, given, {"cache": cache, **by_step}, values))
-        return launches
+        """Launches of the kernels of all regions, see `_launch`. The first stress has no cache if there are flows."""
+        caches = {} if self._flowing else self._caches
+        return [self._one(part, k, backward, caches.get((part, k)), {}, values) for k in self._regions]
+
+    def _one(
+        self,
+        part: str,
+        k: int,
+        backward: bool,
+        cache: Tensor | None,
+        given: Mapping[str, Any],
+        values: Mapping[str, tuple[Tensor, str | None]],
+    ) -> Repeated:
+        """Launch of the kernel of a region, with further arguments by name."""
+        law, here, weights = self._parts[part][k]
+        kernel, own = law.kernel(self._ws.F[0][here], weights, backward)
+        by_step = {"partials": self._partials.get((part, k))} if backward else {}
+        if backward and not law.native_rows:
+            own |= {f"total{i}": total for i, total in enumerate(self._sums.get((part, k), ()))}
+        if cache is not None and not law.native_rows:
+            own["cached"] = 2 if backward else 1
+        return self._launch(kernel, here, {**own, **given}, {"cache": cache, **by_step}, values)
 
     def _flows(self, earlier: bool = False) -> list[Repeated]:
         """Return map of a step and the stress of the next, or the same of the step before."""
-        ws = self._ws
+        ws, launches = self._ws, []
         kernel = analytic_kernels.flow_kernel(ws.size.dtype)
-        values = dict(F=(ws.F_trial, "cached"), out=(ws.F, "after"), stress_out=(ws.tau, "stressed after"))
-        launches = [
-            self._launch(
-                kernel, *self._both(k), {"cache": self._caches.get(("plasticity", k))}, values=values
-            )
-            for k in self._regions
-        ]
+        F, out, tau = (ws.F_trial, "cached"), (ws.F, "after"), (ws.tau, "stressed after")
+        for k in self._regions:
+            cache = self._caches.get(("plasticity", k))
+            if self._is_analytic(k):
+                values = dict(F=F, out=out, stress_out=tau)
+                launches.append(self._launch(kernel, *self._both(k), {"cache": cache}, values))
+                continue
+            launches.append(self._one("plasticity", k, False, cache, {}, dict(F=F, out=out)))
+            launches.append(self._one("elasticity", k, False, *self._shared(k), dict(F=out, out=tau)))
         return [one.earlier() for one in launches] if earlier else launches
 
     def _flow_adjoints(self) -> list[Repeated]:
-        ws = self._ws
+        ws, launches = self._ws, []
         kernel = analytic_kernels.flow_vjp_kernel(ws.size.dtype)
-        values = dict(
-            F=(ws.F_trial, "cached"),
-            returned_F=(ws.F, "after"),
-            grad_out=(ws.grad_F, None),
-            grad_stress=(ws.grad_tau, None),
-            grad_F=(ws.grad_F_trial, None),
-        )
-        launches = []
+        F, returned = (ws.F_trial, "cached"), (ws.F, "after")
+        grads = dict(grad_out=(ws.grad_F, None), grad_F=(ws.grad_F_trial, None))
         for k in self._regions:
-            by_step = {
-                "cache": self._caches.get(("plasticity", k)),
-                "partials": self._partials.get(("plasticity", k)),
-                "elastic_partials": self._partials.get(("elasticity", k)),
-            }
-            launches.append(self._launch(kernel, *self._both(k), by_step, values=values))
+            cache = self._caches.get(("plasticity", k))
+            if self._is_analytic(k):
+                by_step = {
+                    "cache": cache,
+                    "partials": self._partials.get(("plasticity", k)),
+                    "elastic_partials": self._partials.get(("elasticity", k)),
+                }
+                values = dict(F=F, returned_F=returned, grad_stress=(ws.grad_tau, None), **grads)
+                launches.append(self._launch(kernel, *self._both(k), by_step, values))
+                continue
+            # Singular values of the step are overwritten.
+            if cache is not None and len(cache) < ws.size.n_cached_steps:
+                launches.append(self._one("plasticity", k, False, cache, {}, dict(F=F, out=returned)))
+            own, given = self._shared(k)
+            values = dict(F=returned, grad_out=(ws.grad_tau, None), grad_F=(ws.grad_F, None))
+            launches.append(self._one("elasticity", k, True, own, {"adds": 1, **given}, values))
+            launches.append(self._one("plasticity", k, True, cache, {}, dict(F=F, **grads)))
         return launches
+
+    def _shared(self, k: int) -> tuple[Tensor | None, dict[str, int]]:
+        """Cache of the stress after the return map of a region, which has written it unless it is the identity."""
+        if self._is_separate(k):
+            return self._caches.get(("elasticity", k)), {}
+        return self._caches["plasticity", k], {"cached": 3}
+
+    def _is_separate(self, k: int) -> bool:
+        """Whether the return map of a region has no singular values for the kernel of its stress."""
+        return not self._is_analytic(k) and self._parts["plasticity"][k][0].native_rows
+
+    def _is_analytic(self, k: int) -> bool:
+        """Whether one kernel has the return map and the stress of a region."""
+        return all(self._parts[part][k][0].native_rows for part in ("elasticity", "plasticity"))
 
     def _both(self, k: int) -> tuple[slice, dict[str, Any]]:
         """Particles of a region, and arguments for both of its laws."""
@@ -281,10 +328,8 @@ class SegmentLoop:
         ws, arguments, indices = self._ws, {}, {}
         labels = {arg.label: position for position, arg in enumerate(kernel.adj.args)}
         for name, value in given.items():
-            if isinstance(value, Tensor):
-                self._memory.append(value)
-                value = value.data_ptr()
-            arguments[labels[name]] = value
+            self._memory.append(value)
+            arguments[labels[name]] = _number(value)
         for name, (value, at) in values.items():
             address = (value if at is None else value[0])[here].data_ptr()
             arguments[labels[name]] = address
@@ -302,6 +347,11 @@ def _launch(kernel: wp.Kernel) -> wp.Launch:
     """A recorded launch of a law's kernel, whose arguments are numbers."""
     inputs = [0] * len(kernel.adj.args)
     return wp.launch(kernel, dim=1, inputs=inputs, device="cpu", block_dim=1, record_cmd=True)
+
+
+def _number(value: Tensor | float) -> float:
+    """An argument of a kernel: a number, or the address of a tensor."""
+    return value.data_ptr() if isinstance(value, Tensor) else value
 
 
 def _stride(value: Tensor) -> int:

@@ -24,7 +24,7 @@ from neuma_lib.sim.kernels import NO_FAULT
 from neuma_lib.sim.memory import MemoryPlan
 from neuma_lib.sim.model import MPM, MaterialRegion, law_weights
 from neuma_lib.sim.scatter import scatter_for
-from neuma_lib.sim.segment_loop import SegmentLoop
+from neuma_lib.sim.segment_loop import SegmentLoop, segment_loop
 from neuma_lib.sim.sequence import Repeated
 from neuma_lib.sim.state import State
 from neuma_lib.sim.workspace import Workspace, WorkspaceSize, pooled_workspace
@@ -130,7 +130,7 @@ class Simulation:
         result = tuple(value.new_empty(len(frames), *value.shape) for value in start)
         for state, value in zip(states, start, strict=True):
             state[0].copy_(value)
-        if self._uses_graphs:
+        if self._uses_graphs or self._loops:
             ws.load_weights(weights)
             weights = ws.weights
         passive = None if tracers is None else _Tracers(ws, tracers, frames)
@@ -180,7 +180,7 @@ class Simulation:
     ) -> tuple[tuple[Tensor, ...], list[Tensor]]:
         """From gradients of the states at the frames to those of the initial state and of the weights."""
         ws = self.workspace
-        if self._uses_graphs:
+        if self._uses_graphs or self._loops:
             weights, grad_weights = ws.weights, ws.grad_weights
         else:
             grad_weights = [torch.zeros_like(w) for w in weights]
@@ -227,7 +227,7 @@ class Simulation:
             self._evaluate("elasticity", n, F, weights, ws.tau[ws.stress_at(n)], fill_cache=True)
             ws.trial_deformation(n)
         if not self.plan.caches_steps or ws.native:
-            ws.transfer_to_grid(n)
+            ws.transfer_to_grid(n, again=True)
         self._vjp("plasticity", n, F_trial, weights, ws.grad_F, ws.grad_F_trial, sums)
         ws.transfer_adjoint(n)
         self._vjp("elasticity", n, F, weights, ws.grad_tau, ws.grad_F_elastic, sums)
@@ -255,7 +255,7 @@ class Simulation:
                 for part in PARTS
             }
             caches_steps = self.plan is not None and self.plan.caches_steps
-            self._loop = SegmentLoop(self.workspace, parts, caches_steps, self._law_cache_bytes, tracers)
+            self._loop = segment_loop(self.workspace, parts, caches_steps, self._law_cache_bytes, tracers)
 
     def _advance(
         self, steps: int, weights: Sequence[Tensor], passive: _Tracers | None = None, first: int = 0

@@ -11,49 +11,16 @@
     typedef Real Eight __attribute__((vector_size(8 * sizeof(Real)), aligned(sizeof(Real))));
     typedef Real Row __attribute__((vector_size(16 * sizeof(Real)), aligned(sizeof(Real))));
     typedef int Index __attribute__((vector_size(4 * sizeof(int))));
-    struct Columns { Four c[3]; };  // of a matrix. Their last lanes are zero.
+    typedef Row Pack;
+    const int WIDTH = 16;
+    #define LANE(x, l) ((Real*)&(x))[l]
     #define SHUFFLE __builtin_shufflevector
     #define INLINE __attribute__((always_inline))
     const int n = c.n;
     const Real inv_dx = c.inv_dx, dt = c.dt;
     const Four zero = {};
-    auto repeat = [](Four a) INLINE { return SHUFFLE(a, a, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3); };
-    auto load3 = [](const Real* p) INLINE { return Four{p[0], p[1], p[2], Real(0)}; };
-    auto store3 = [](Real* p, Four a) INLINE { for (int k = 0; k < 3; ++k) p[k] = a[k]; };
-    // Rows of a matrix in memory. Loads and stores of four numbers overlap instead of passing its end.
-    auto load_rows = [&](const Real* p) INLINE {
-        const Four a = *(const Four*)p, b = *(const Four*)(p + 3), d = *(const Four*)(p + 5);
-        return Columns{{SHUFFLE(a, zero, 0, 1, 2, 4), SHUFFLE(b, zero, 0, 1, 2, 4), SHUFFLE(d, zero, 1, 2, 3, 4)}};
-    };
-    auto store_rows = [](Real* p, const Columns& a) INLINE {
-        *(Four*)p = a.c[0];
-        *(Four*)(p + 3) = a.c[1];
-        *(Four*)(p + 5) = SHUFFLE(a.c[1], a.c[2], 2, 4, 5, 6);
-    };
-    auto transposed = [&](const Columns& a) INLINE {
-        const Four low = SHUFFLE(a.c[0], a.c[1], 0, 4, 1, 5), high = SHUFFLE(a.c[0], a.c[1], 2, 6, 3, 7);
-        const Four last = SHUFFLE(a.c[2], zero, 0, 1, 2, 4);
-        return Columns{{SHUFFLE(low, last, 0, 1, 4, 7), SHUFFLE(low, last, 2, 3, 5, 7), SHUFFLE(high, last, 0, 1, 6, 7)}};
-    };
-    // sum_k a.c[k] b[k]
-    auto times = [](const Columns& a, Four b) INLINE { return a.c[0] * b[0] + a.c[1] * b[1] + a.c[2] * b[2]; };
-    auto each_sum = [&](Four a, Four b, Four d) INLINE {
-        const Columns t = transposed({{a, b, d}});
-        return t.c[0] + t.c[1] + t.c[2];
-    };
-    auto folded = [](const Row& a) INLINE {
-        return SHUFFLE(a, a, 0, 1, 2, 3) + SHUFFLE(a, a, 4, 5, 6, 7) + SHUFFLE(a, a, 8, 9, 10, 11);
-    };
-    // Row k of F_trial = (I + dt C) F. Numbers of C come from memory, see `Block`.
-    auto trial_of = [&](const Columns& F_rows, const Real* C, int k) INLINE {
-        return F_rows.c[k] + dt * (F_rows.c[0] * C[3 * k] + F_rows.c[1] * C[3 * k + 1] + F_rows.c[2] * C[3 * k + 2]);
-    };
-    auto store_trial = [&](Real* out, const Real* F, const Real* C) INLINE {
-        const Columns rows = load_rows(F);
-        store_rows(out, {{trial_of(rows, C, 0), trial_of(rows, C, 1), trial_of(rows, C, 2)}});
-    };
-    // First or later addition to a sum
-    auto add = [](bool first, Row& sum, Real w, const Row& a) INLINE {
+    // First or later addition to a sum. An argument of 512 bits also makes LLVM use registers of that size.
+    auto add = [](bool first, Row& sum, Real w, Row a) INLINE {
         if (first)
             sum = w * a;
         else
@@ -62,7 +29,7 @@
     const Row steps = {0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 0, 0, 0, 0};
 
 //// lanes
-    // Vectors of up to 16 particles, one per lane
+    // Vectors and matrices of up to 16 particles, with a row for each number and a particle per lane
     auto load_lanes = [](const Real* p, int used, Row* x) INLINE {
         if (used == 16) {
             const Row a = *(const Row*)p, b = *(const Row*)(p + 16), d = *(const Row*)(p + 32);
@@ -76,11 +43,41 @@
             for (int l = 0; l < 16; ++l)
                 for (int axis = 0; axis < 3; ++axis) x[axis][l] = p[3 * (l < used ? l : 0) + axis];
     };
+    auto store_lanes = [](Real* p, int used, const Row* x) INLINE {
+        if (used == 16) {
+            *(Row*)(p + 0) = SHUFFLE(SHUFFLE(x[0], x[1], 0, 16, -1, 1, 17, -1, 2, 18, -1, 3, 19, -1, 4, 20, -1, 5), x[2],
+                0, 1, 16, 3, 4, 17, 6, 7, 18, 9, 10, 19, 12, 13, 20, 15);
+            *(Row*)(p + 16) = SHUFFLE(SHUFFLE(x[0], x[1], 21, -1, 6, 22, -1, 7, 23, -1, 8, 24, -1, 9, 25, -1, 10, 26), x[2],
+                0, 21, 2, 3, 22, 5, 6, 23, 8, 9, 24, 11, 12, 25, 14, 15);
+            *(Row*)(p + 32) = SHUFFLE(SHUFFLE(x[0], x[1], -1, 11, 27, -1, 12, 28, -1, 13, 29, -1, 14, 30, -1, 15, 31, -1), x[2],
+                26, 1, 2, 27, 4, 5, 28, 7, 8, 29, 10, 11, 30, 13, 14, 31);
+        } else
+            for (int l = 0; l < used; ++l)
+                for (int axis = 0; axis < 3; ++axis) p[3 * l + axis] = x[axis][l];
+    };
+    auto load_matrices = [](const Real* p, int used, Row* x) INLINE { Matrices::load(p, used, x, false); };
+    auto store_matrices = [](Real* p, int used, const Row* x) INLINE { Matrices::store(p, used, x); };
+    auto load_numbers = [](const Real* p, int used) INLINE {
+        if (used == 16) return *(const Row*)p;
+        Row x = {};
+        for (int l = 0; l < used; ++l) x[l] = p[l];
+        return x;
+    };
+    // F_trial = (I + dt C) F
+    auto store_trial = [&](Real* out, const Real* from, const Row* C, int used) INLINE {
+        Row F[9], trial[9];
+        load_matrices(from, used, F);
+        for (int k = 0; k < 9; ++k) {
+            const int i = k / 3 * 3, j = k % 3;
+            trial[k] = F[k] + dt * (C[i] * F[j] + C[i + 1] * F[3 + j] + C[i + 2] * F[6 + j]);
+        }
+        store_matrices(out, used, trial);
+    };
 
 //// block
     // Weights of up to 16 particles, one per lane. Loops over the particles read them as scalars from memory, which costs
     // less than to move them between lanes.
-    typedef int Indices __attribute__((vector_size(16 * sizeof(int))));
+    typedef int Indices __attribute__((vector_size(16 * sizeof(int)), aligned(sizeof(int))));
     struct Block {
         Real f[3][16];  // distance from the first node [dx]
         Real w[3][3][16], wd[3][3][16], slope[3][3][16];  // by axis and node: weights, moments and slopes
@@ -114,8 +111,9 @@
             for (int j = 0; j < 3; ++j)
                 *(Row*)block.w_ij[3 * i + j] = *(const Row*)block.w[0][i] * *(const Row*)block.w[1][j];
         const Indices line = base[0] * n + base[1];
-        for (int l = 0; l < 16; ++l) block.line[l] = line[l], block.k[l] = base[2][l];
-        for (int l = 0; l < 16; ++l) block.first[l] = (copy * n * n + block.line[l]) * n + block.k[l];
+        *(Indices*)block.line = line;
+        *(Indices*)block.k = base[2];
+        *(Indices*)block.first = (copy * n * n + line) * n + base[2];
     };
     // Four numbers of an axis spread over the lanes of a row
     auto spread = [&](const Real (*w)[16], int l) INLINE {
@@ -123,6 +121,25 @@
         const Four a = {w0, w0, w0, w0}, b = {w1, w1, w1, w1}, d = {w2, w2, w2, w2};
         const Eight ab = SHUFFLE(a, b, 0, 1, 2, 3, 4, 5, 6, 7), d0 = SHUFFLE(d, zero, 0, 1, 2, 3, 4, 5, 6, 7);
         return SHUFFLE(ab, d0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+    };
+    // Of each particle of a block: a row of numbers of three nodes, and the sum over the nodes with weights w
+    typedef Real Rows[16][16];
+    auto add_nodes = [&](const Rows& rows, const Real (*w)[16], Row* sum) INLINE {
+        for (int node = 0; node < 3; ++node) {
+            Row x[4];
+            Matrices::load_four(rows[0] + 4 * node, 16, x);
+            for (int k = 0; k < 4; ++k) sum[k] = node ? sum[k] + *(const Row*)w[node] * x[k] : *(const Row*)w[node] * x[k];
+        }
+    };
+    auto add_all = [&](const Rows& rows, const Real (*w)[16]) INLINE {
+        Row sum[4];
+        add_nodes(rows, w, sum);
+        return (sum[0] + sum[1]) + (sum[2] + sum[3]);
+    };
+    // Three equal columns of four numbers
+    auto repeat = [](const Real* p) INLINE {
+        const Four a = *(const Four*)p;
+        return SHUFFLE(a, a, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3);
     };
     #define EACH_BLOCK                                                                                       \
         for (int copy = 0; copy < c.copies; ++copy)                                                          \
@@ -166,24 +183,62 @@
         }
     };
 
+// Nodes that particles touch of a step, one after the other, with their spans and, last, whether they fit.
+//// keep
+    const int rows_kept = c.copies * lines;
+    auto span_of = [&](int row) INLINE { return (int*)spans.data + (row / lines * 6 + 4) * lines + row % lines; };
+    int* const kept_span = (int*)kept_spans.data;
+    auto keep_nodes = [&] {
+        const int room = kept.shape[0];
+        int used = 0;
+        for (int row = 0; row < rows_kept; ++row) {
+            const int low = span_of(row)[0], high = span_of(row)[lines], count = high < low ? 0 : high + 1 - low;
+            kept_span[2 * row] = low, kept_span[2 * row + 1] = high;
+            if (count > room - used) break;
+            for (int k = 0; k < count; ++k)
+                ((Four*)kept.data)[used + k] = ((const Four*)grid.data)[(size_t)row * n + low + k];
+            used += count;
+            if (row == rows_kept - 1) {
+                kept_span[2 * rows_kept] = 1;
+                return;
+            }
+        }
+        kept_span[2 * rows_kept] = 0;
+    };
+
+// Sets the grid to the kept nodes and clears the gradients of the nodes.
+//// restore
+    if (!kept_span[2 * rows_kept]) return 0;
+    for (int copy = 0; copy < c.copies; ++copy) clear(copy, (Real*)grid.data, grid.shape[0], grid.shape[1] * (size_t)4);
+    const Four* next = (const Four*)kept.data;
+    for (int row = 0; row < rows_kept; ++row) {
+        const int low = kept_span[2 * row], high = kept_span[2 * row + 1];
+        span_of(row)[0] = low, span_of(row)[lines] = high;
+        for (int k = low; k <= high; ++k) ((Four*)grid.data)[(size_t)row * n + k] = *next++;
+    }
+    return 1;
+
 //// momentum
-    // q = (m v + A d, m) at a node and what it grows by from node to node, as in `kernels.p2g`: rows of equal columns
-    struct Momentum { Row q, A[3]; Real stress; };
+    // q = (m v + A d, m) at the first node and columns of A, by which it grows from node to node, as in `kernels.p2g`
+    Real momenta[16][16];
     const Real stress_factor = Real(4) * dt * inv_dx * inv_dx;
-    auto momentum = [&](int p, int l) INLINE {
-        const Real m = ((const Real*)mass.data)[p], m_dx = c.dx * m;
-        Momentum r;
-        r.stress = stress_factor * ((const Real*)vol0.data)[p];
-        const Real stress_dx = c.dx * r.stress;
-        const Real *pC = (const Real*)C.data + 9 * p, *pT = (const Real*)tau.data + 9 * p, *pv = (const Real*)v.data + 3 * p;
-        const Eight a = m_dx * *(const Eight*)pC - stress_dx * *(const Eight*)pT;
-        const Eight b = {m_dx * pC[8] - stress_dx * pT[8]};
-        r.A[0] = SHUFFLE(a, b, 0, 3, 6, 9, 0, 3, 6, 9, 0, 3, 6, 9, 0, 3, 6, 9);
-        r.A[1] = SHUFFLE(a, b, 1, 4, 7, 9, 1, 4, 7, 9, 1, 4, 7, 9, 1, 4, 7, 9);
-        r.A[2] = SHUFFLE(a, b, 2, 5, 8, 9, 2, 5, 8, 9, 2, 5, 8, 9, 2, 5, 8, 9);
-        r.q = m * repeat(Four{pv[0], pv[1], pv[2], Real(1)}) - block.f[0][l] * r.A[0] - block.f[1][l] * r.A[1] +
-            (steps - block.f[2][l]) * r.A[2];
-        return r;
+    auto prepare_momentum = [&](int begin, int used, Row* A, Row& m, Row& stress) INLINE {
+        Row T[9], q[3];
+        load_matrices((const Real*)C.data + 9 * begin, used, A);
+        load_matrices((const Real*)tau.data + 9 * begin, used, T);
+        load_lanes((const Real*)v.data + 3 * begin, used, q);
+        m = load_numbers((const Real*)mass.data + begin, used);
+        stress = stress_factor * load_numbers((const Real*)vol0.data + begin, used);
+        Matrices::prefetch((const Real*)C.data + 9 * (begin + 32), 9 * 16);
+        Matrices::prefetch((const Real*)tau.data + 9 * (begin + 32), 9 * 16);
+        const Row m_dx = c.dx * m, stress_dx = c.dx * stress, none = {};
+        for (int k = 0; k < 9; ++k) A[k] = m_dx * A[k] - stress_dx * T[k];
+        for (int k = 0; k < 3; ++k) {
+            q[k] = m * q[k];
+            for (int axis = 0; axis < 3; ++axis) q[k] -= *(const Row*)block.f[axis] * A[3 * k + axis];
+        }
+        Matrices::store_four(momenta[0], 16, q[0], q[1], q[2], m);
+        for (int k = 0; k < 3; ++k) Matrices::store_four(momenta[0] + 4 + 4 * k, 16, A[k], A[3 + k], A[6 + k], none);
     };
 
 //// p2g
@@ -193,10 +248,12 @@
         OPEN_BLOCK;
         prepare((const Real*)x.data + 3 * begin, used, copy);
         int* const span = (int*)spans.data + 6 * lines * copy;
+        Row A[9], m, stress;
+        prepare_momentum(begin, used, A, m, stress);
         for (int l = 0; l < used; ++l) {
-            const Momentum u = momentum(begin + l, l);
-            const Row w = spread(block.w[2], l), by_i = w * u.A[0], by_j = w * u.A[1];
-            Row q_i = w * u.q;
+            const Real* const from = momenta[l];
+            const Row w = spread(block.w[2], l), by_i = w * repeat(from + 4), by_j = w * repeat(from + 8);
+            Row q_i = w * (repeat(from) + steps * repeat(from + 12));
             const int line = block.line[l], k = block.k[l];
             span[line] = k < span[line] ? k : span[line];
             span[lines + line] = k > span[lines + line] ? k : span[lines + line];
@@ -212,6 +269,7 @@
         }
     }
     for (int copy = 0; copy < c.copies; ++copy) grow(copy);
+    keep_nodes();
 
 // v_i = (m v)_i / m_i + dt g without walls and clamps
 //// grid_update
@@ -243,12 +301,12 @@
         int64_t* const flag = (int64_t*)faults.data + 3 * copy + (is_finite ? is_slow ? 2 : 1 : 0);
         if (!(is_finite && is_slow && is_inside) && here < *flag) *flag = here;
     };
+    Rows all = {}, along_i = {}, along_j = {};
     EACH_BLOCK {
         OPEN_BLOCK;
         prepare((const Real*)x.data + 3 * begin, used, copy);
         for (int l = 0; l < used; ++l) {
-            const int p = begin + l;
-            Row all, along_i, along_j;
+            Row total, total_i, total_j;
             for (int i = 0; i < 3; ++i) {
                 Row sum, moment;
                 for (int j = 0; j < 3; ++j) {
@@ -256,65 +314,98 @@
                     add(j == 0, sum, block.w[1][j][l], row);
                     add(j == 0, moment, block.wd[1][j][l], row);
                 }
-                add(i == 0, all, block.w[0][i][l], sum);
-                add(i == 0, along_i, block.wd[0][i][l], sum);
-                add(i == 0, along_j, block.w[0][i][l], moment);
+                add(i == 0, total, block.w[0][i][l], sum);
+                add(i == 0, total_i, block.wd[0][i][l], sum);
+                add(i == 0, total_j, block.w[0][i][l], moment);
             }
-            const Row w = spread(block.w[2], l), w_factor = factor * w;
-            store3((Real*)v_after.data + 3 * p, folded(w * all));
-            Real* const pC = (Real*)C_after.data + 9 * p;
-            store_rows(pC, transposed({{folded(w_factor * along_i), folded(w_factor * along_j),
-                folded(factor * spread(block.wd[2], l) * all)}}));
+            *(Row*)all[l] = total, *(Row*)along_i[l] = total_i, *(Row*)along_j[l] = total_j;
         }
-        const Real *pv = (const Real*)v_after.data + 3 * begin, *pC = (const Real*)C_after.data + 9 * begin;
-        Real* const px = (Real*)x_after.data + 3 * begin;
-        bool fine = true;
-        for (int k = 0; k < 3 * used; ++k) {
-            Real place = ((const Real*)x.data)[3 * begin + k] + dt * pv[k];
-            place = place < c.clamp_high ? place : c.clamp_high;
-            place = place > c.clamp_low ? place : c.clamp_low;
-            px[k] = place;
-            fine &= (dt * pv[k] <= c.dx) & (dt * pv[k] >= -c.dx) & (place >= c.leave_low) & (place <= c.leave_high);
+        Matrices::prefetch((Real*)C_after.data + 9 * (begin + 32), 9 * 16);
+        Matrices::prefetch((Real*)F_trial.data + 9 * (begin + 32), 9 * 16);
+        Matrices::prefetch((Real*)x_after.data + 3 * (begin + 32), 3 * 16);
+        Matrices::prefetch((Real*)v_after.data + 3 * (begin + 32), 3 * 16);
+        Row v_p[4], place[3], moment[3][4], C_p[9];
+        load_lanes((const Real*)x.data + 3 * begin, used, place);
+        add_nodes(all, block.w[2], v_p);
+        add_nodes(along_i, block.w[2], moment[0]);
+        add_nodes(along_j, block.w[2], moment[1]);
+        add_nodes(all, block.wd[2], moment[2]);
+        const Row none = {};
+        auto fine = none == none;
+        for (int k = 0; k < 9; ++k) {
+            C_p[k] = factor * moment[k % 3][k / 3];
+            fine &= C_p[k] - C_p[k] == none;
         }
-        for (int k = 0; k < 9 * used; ++k) fine &= pC[k] - pC[k] == Real(0);
-        if (!fine)
-            for (int l = 0; l < used; ++l) fault(begin + l, copy);
-        for (int p = begin; p < begin + used; ++p)
-            store_trial((Real*)F_trial.data + 9 * p, (const Real*)F.data + 9 * p, (const Real*)C_after.data + 9 * p);
+        for (int k = 0; k < 3; ++k) {
+            const Row moved = dt * v_p[k];
+            place[k] += moved;
+            place[k] = place[k] < c.clamp_high ? place[k] : none + c.clamp_high;
+            place[k] = place[k] > c.clamp_low ? place[k] : none + c.clamp_low;
+            fine &= (moved <= c.dx) & (moved >= -c.dx) & (place[k] >= c.leave_low) & (place[k] <= c.leave_high);
+        }
+        store_lanes((Real*)x_after.data + 3 * begin, used, place);
+        store_lanes((Real*)v_after.data + 3 * begin, used, v_p);
+        store_matrices((Real*)C_after.data + 9 * begin, used, C_p);
+        store_trial((Real*)F_trial.data + 9 * begin, (const Real*)F.data + 9 * begin, C_p, used);
+        bool all_fine = true;
+        for (int l = 0; l < 16; ++l) all_fine &= fine[l] != 0;
+        for (int l = 0; l < (all_fine ? 0 : used); ++l) fault(begin + l, copy);
     }
 
 //// trial
-    for (int p = 0; p < c.copies * c.particles; ++p)
-        store_trial((Real*)F_trial.data + 9 * p, (const Real*)F.data + 9 * p, (const Real*)C_after.data + 9 * p);
+    for (int begin = 0, used; begin < c.copies * c.particles; begin += used) {
+        used = c.copies * c.particles - begin < 16 ? c.copies * c.particles - begin : 16;
+        Row C_p[9];
+        load_matrices((const Real*)C_after.data + 9 * begin, used, C_p);
+        store_trial((Real*)F_trial.data + 9 * begin, (const Real*)F.data + 9 * begin, C_p, used);
+    }
 
 //// g2p_adjoint
-    Real g_x[52], g_v[52];
+    Real motions[16][16];  // u at the first node and columns of D, see `adjoint_kernels.g2p_adjoint`
+    Rows along_i = {}, along_j = {}, along_k = {};
     EACH_BLOCK {
         OPEN_BLOCK;
         prepare((const Real*)x.data + 3 * begin, used, copy);
-        for (int k = 0; k < 3 * used; ++k) {
-            const Real place = ((const Real*)x_after.data)[3 * begin + k], g = ((const Real*)grad_x.data)[3 * begin + k];
-            g_x[k] = place > c.clamp_low && place < c.clamp_high ? g : Real(0);
-            g_v[k] = ((const Real*)grad_v.data)[3 * begin + k] + dt * g_x[k];
-        }
-        for (int l = 0; l < used; ++l) {
-            const int p = begin + l;
-            if (HELD && ((const Real*)mass.data)[p] == Real(0)) continue;
-            const Columns g = load_rows((const Real*)grad_F_trial.data + 9 * p), g_T = transposed(g);
-            const Columns g_C = transposed(load_rows((const Real*)grad_C.data + 9 * p));
-            const Real *pF = (const Real*)F.data + 9 * p, *pC = (const Real*)C_after.data + 9 * p;
-            Columns grad_F_rows;
-            Four D[3];
-            for (int k = 0; k < 3; ++k) {
-                grad_F_rows.c[k] = g.c[k] + dt * (g.c[0] * pC[k] + g.c[1] * pC[3 + k] + g.c[2] * pC[6 + k]);
-                D[k] = (Real(4) * inv_dx) *
-                    (g_C.c[k] + dt * (g_T.c[0] * pF[3 * k] + g_T.c[1] * pF[3 * k + 1] + g_T.c[2] * pF[3 * k + 2]));
+        Row g_x[3], g_v[3], place[3], D[9];
+        const Row none = {};
+        {
+            Row g[9], F_p[9], C_p[9], grad_F_p[9];
+            Matrices::prefetch((const Real*)F.data + 9 * (begin + 32), 9 * 16);
+            load_lanes((const Real*)x_after.data + 3 * begin, used, place);
+            load_lanes((const Real*)grad_x.data + 3 * begin, used, g_x);
+            load_lanes((const Real*)grad_v.data + 3 * begin, used, g_v);
+            load_matrices((const Real*)grad_F_trial.data + 9 * begin, used, g);
+            load_matrices((const Real*)grad_C.data + 9 * begin, used, D);
+            load_matrices((const Real*)F.data + 9 * begin, used, F_p);
+            load_matrices((const Real*)C_after.data + 9 * begin, used, C_p);
+            const Row m = HELD ? load_numbers((const Real*)mass.data + begin, used) : none + Real(1);
+            const auto free = m != none;
+            for (int k = 0; k < 9; ++k) {
+                const int i = k / 3, j = k % 3;
+                const Row turned = g[k] + dt * (C_p[i] * g[j] + C_p[3 + i] * g[3 + j] + C_p[6 + i] * g[6 + j]);
+                grad_F_p[k] = HELD ? free ? turned : g[k] : turned;
+                D[k] = (Real(4) * inv_dx) * (D[k] + dt * (
+                    g[3 * i] * F_p[3 * j] + g[3 * i + 1] * F_p[3 * j + 1] + g[3 * i + 2] * F_p[3 * j + 2]));
             }
-            store_rows((Real*)grad_F.data + 9 * p, grad_F_rows);
-            const Row w = spread(block.w[2], l), by_i = repeat(D[0]), by_j = repeat(D[1]);
-            Row u_i = repeat(load3(g_v + 3 * l)) - block.f[0][l] * by_i - block.f[1][l] * by_j +
-                (steps - block.f[2][l]) * repeat(D[2]);
-            Row along_i, along_j, along_k;
+            store_matrices((Real*)grad_F.data + 9 * begin, used, grad_F_p);
+            for (int k = 0; k < 3; ++k) {
+                const auto inside = (place[k] > c.clamp_low) & (place[k] < c.clamp_high);
+                const Row moves = inside ? g_x[k] : none;
+                g_v[k] += dt * moves;
+                for (int axis = 0; axis < 3; ++axis) g_v[k] -= *(const Row*)block.f[axis] * D[3 * k + axis];
+                g_x[k] = HELD ? free ? moves : g_x[k] : moves;
+            }
+        }
+        Matrices::store_four(motions[0], 16, g_v[0], g_v[1], g_v[2], none);
+        for (int k = 0; k < 3; ++k) Matrices::store_four(motions[0] + 4 + 4 * k, 16, D[k], D[3 + k], D[6 + k], none);
+        for (int l = 0; l < used; ++l) {
+            if (HELD && ((const Real*)mass.data)[begin + l] == Real(0)) {
+                *(Row*)along_i[l] = *(Row*)along_j[l] = *(Row*)along_k[l] = none;
+                continue;
+            }
+            const Real* const from = motions[l];
+            const Row w = spread(block.w[2], l), by_i = repeat(from + 4), by_j = repeat(from + 8);
+            Row u_i = repeat(from) + steps * repeat(from + 12), total_i, total_j, total_k;
             for (int i = 0; i < 3; ++i) {
                 Row u_ij = u_i, sum, sloped;
                 for (int j = 0; j < 3; ++j) {
@@ -325,17 +416,26 @@
                     add(j == 0, sloped, block.slope[1][j][l], vu);
                     if (j < 2) u_ij += by_j;
                 }
-                add(i == 0, along_i, block.slope[0][i][l], sum);
-                add(i == 0, along_j, block.w[0][i][l], sloped);
-                add(i == 0, along_k, block.w[0][i][l], sum);
+                add(i == 0, total_i, block.slope[0][i][l], sum);
+                add(i == 0, total_j, block.w[0][i][l], sloped);
+                add(i == 0, total_k, block.w[0][i][l], sum);
                 u_i += by_i;
             }
-            const Four v_new = load3((const Real*)v_after.data + 3 * p);
-            const Four moving = each_sum(
-                folded(w * along_i) - D[0] * v_new, folded(w * along_j) - D[1] * v_new,
-                folded(spread(block.slope[2], l) * along_k) - D[2] * v_new);
-            store3((Real*)grad_x.data + 3 * p, load3(g_x + 3 * l) + inv_dx * moving);
+            *(Row*)along_i[l] = total_i, *(Row*)along_j[l] = total_j, *(Row*)along_k[l] = total_k;
         }
+        Row v_new[3];
+        load_lanes((const Real*)v_after.data + 3 * begin, used, v_new);
+        const Row moving[3] = {
+            add_all(along_i, block.w[2]), add_all(along_j, block.w[2]), add_all(along_k, block.slope[2])};
+        for (int k = 0; k < 3; ++k) {
+            const Row change = moving[k] - (D[k] * v_new[0] + D[3 + k] * v_new[1] + D[6 + k] * v_new[2]);
+            if (HELD) {
+                const Row m = load_numbers((const Real*)mass.data + begin, used);
+                g_x[k] = m != none ? g_x[k] + inv_dx * change : g_x[k];
+            } else
+                g_x[k] += inv_dx * change;
+        }
+        store_lanes((Real*)grad_x.data + 3 * begin, used, g_x);
     }
 
 //// grid_adjoint
@@ -353,13 +453,17 @@
     }
 
 //// p2g_adjoint
+    Rows all = {}, moment_i = {}, moment_j = {}, along_i = {}, along_j = {}, along_k = {};
     EACH_BLOCK {
         OPEN_BLOCK;
         prepare((const Real*)x.data + 3 * begin, used, copy);
+        Row A[9], m, stress;
+        prepare_momentum(begin, used, A, m, stress);
         for (int l = 0; l < used; ++l) {
-            const int p = begin + l;
-            const Momentum u = momentum(p, l);
-            Row q_i = u.q, all, moment_i, moment_j, along_i, along_j, along_k;
+            const Real* const from = momenta[l];
+            const Row by_i = repeat(from + 4), by_j = repeat(from + 8);
+            Row q_i = repeat(from) + steps * repeat(from + 12);
+            Row total, first_i, first_j, total_i, total_j, total_k;
             for (int i = 0; i < 3; ++i) {
                 Row q_ij = q_i, sum, moment, sum_q, sloped;
                 for (int j = 0; j < 3; ++j) {
@@ -369,54 +473,56 @@
                     add(j == 0, moment, block.wd[1][j][l], g);
                     add(j == 0, sum_q, block.w[1][j][l], gq);
                     add(j == 0, sloped, block.slope[1][j][l], gq);
-                    if (j < 2) q_ij += u.A[1];
+                    if (j < 2) q_ij += by_j;
                 }
-                add(i == 0, all, block.w[0][i][l], sum);
-                add(i == 0, moment_i, block.wd[0][i][l], sum);
-                add(i == 0, moment_j, block.w[0][i][l], moment);
-                add(i == 0, along_i, block.slope[0][i][l], sum_q);
-                add(i == 0, along_j, block.w[0][i][l], sloped);
-                add(i == 0, along_k, block.w[0][i][l], sum_q);
-                q_i += u.A[0];
+                add(i == 0, total, block.w[0][i][l], sum);
+                add(i == 0, first_i, block.wd[0][i][l], sum);
+                add(i == 0, first_j, block.w[0][i][l], moment);
+                add(i == 0, total_i, block.slope[0][i][l], sum_q);
+                add(i == 0, total_j, block.w[0][i][l], sloped);
+                add(i == 0, total_k, block.w[0][i][l], sum_q);
+                q_i += by_i;
             }
-            const Real m = ((const Real*)mass.data)[p];
-            const Row w = spread(block.w[2], l), w_dx = c.dx * w;
-            const Four g = SHUFFLE(folded(w * all), zero, 0, 1, 2, 4);
-            const Columns g_A = transposed({{folded(w_dx * moment_i), folded(w_dx * moment_j),
-                folded(c.dx * spread(block.wd[2], l) * all)}});
-            Columns g_C, g_tau;
-            for (int k = 0; k < 3; ++k) g_C.c[k] = m * g_A.c[k], g_tau.c[k] = -u.stress * g_A.c[k];
-            store3((Real*)grad_v.data + 3 * p, m * g);
-            store_rows((Real*)grad_C.data + 9 * p, g_C);
-            store_rows((Real*)grad_tau.data + 9 * p, g_tau);
-            // sums over the four components of a node, of which the last is the mass
-            const Four along[3] = {folded(w * along_i), folded(w * along_j), folded(spread(block.slope[2], l) * along_k)};
-            #define COLUMN(a) SHUFFLE(u.A[a], u.A[a], 0, 1, 2, 3)
-            const Four from_momentum = each_sum(
-                along[0] - COLUMN(0) * g, along[1] - COLUMN(1) * g, along[2] - COLUMN(2) * g);
-            #undef COLUMN
-            const Four from_mass = {along[0][3], along[1][3], along[2][3], Real(0)};
-            Real* const gx = (Real*)grad_x.data + 3 * p;
-            store3(gx, load3(gx) + inv_dx * (from_mass + from_momentum));
+            *(Row*)all[l] = total, *(Row*)moment_i[l] = first_i, *(Row*)moment_j[l] = first_j;
+            *(Row*)along_i[l] = total_i, *(Row*)along_j[l] = total_j, *(Row*)along_k[l] = total_k;
         }
+        Row g[4], g_A[3][4], g_v[3], g_C[9], g_tau[9], g_x[3];
+        add_nodes(all, block.w[2], g);
+        add_nodes(moment_i, block.w[2], g_A[0]);
+        add_nodes(moment_j, block.w[2], g_A[1]);
+        add_nodes(all, block.wd[2], g_A[2]);
+        for (int k = 0; k < 9; ++k) {
+            const Row g_k = c.dx * g_A[k % 3][k / 3];
+            g_C[k] = m * g_k, g_tau[k] = -stress * g_k;
+        }
+        store_matrices((Real*)grad_C.data + 9 * begin, used, g_C);
+        store_matrices((Real*)grad_tau.data + 9 * begin, used, g_tau);
+        load_lanes((const Real*)grad_x.data + 3 * begin, used, g_x);
+        // sums over the four components of a node, of which the last is the mass
+        const Row moving[3] = {
+            add_all(along_i, block.w[2]), add_all(along_j, block.w[2]), add_all(along_k, block.slope[2])};
+        for (int k = 0; k < 3; ++k) {
+            g_v[k] = m * g[k];
+            g_x[k] += inv_dx * (moving[k] - (A[k] * g[0] + A[3 + k] * g[1] + A[6 + k] * g[2]));
+        }
+        store_lanes((Real*)grad_v.data + 3 * begin, used, g_v);
+        store_lanes((Real*)grad_x.data + 3 * begin, used, g_x);
     }
 
-// Particles that may touch an obstacle: those near a face of the unit cube, or all if there are other obstacles. The others
-// keep their velocity and have no displacement.
+// Particles that may touch an obstacle: those near a face of the unit cube, or all if there are other obstacles. If there are
+// some, the others keep their velocity. They have no displacement, as known `again` in the reverse loop.
 //// near
     int count = 0;
     const int N = c.copies * c.particles;
-    for (int k = 0; k < 3 * N; ++k) ((Real*)v_now.data)[k] = ((const Real*)v.data)[k];
-    for (int k = 0; k < 3 * N; ++k) ((Real*)stuck.data)[k] = Real(0);
+    for (int k = 0; k < (again ? 0 : 3 * N); ++k) ((Real*)stuck.data)[k] = Real(0);
     if (others)
         for (; count < N; ++count) ((int*)near.data)[count] = count;
     else
         for (int begin = 0; begin < N; begin += 16) {
             const int used = N - begin < 16 ? N - begin : 16;
-            Row x_p[3], r;
+            Row x_p[3];
             load_lanes((const Real*)x.data + 3 * begin, used, x_p);
-            for (int l = 0; l < 16; ++l) r[l] = ((const Real*)radius.data)[begin + (l < used ? l : 0)];
-            const Row far = Real(1) - r;
+            const Row r = load_numbers((const Real*)radius.data + begin, used), far = Real(1) - r;
             auto outside = (x_p[0] < r) | (x_p[0] > far);
             for (int axis = 1; axis < 3; ++axis) outside |= (x_p[axis] < r) | (x_p[axis] > far);
             bool any = false;
@@ -424,6 +530,7 @@
             for (int l = 0; l < (any ? used : 0); ++l)
                 if (outside[l]) ((int*)near.data)[count++] = begin + l;
         }
+    for (int k = 0; k < (count ? 3 * N : 0); ++k) ((Real*)v_now.data)[k] = ((const Real*)v.data)[k];
     return count;
 
 // Clears what is between the particles that may touch an obstacle.
@@ -436,6 +543,7 @@
     }
 
 //// end
+    #undef LANE
     #undef SHUFFLE
     #undef INLINE
     #undef EACH_BLOCK

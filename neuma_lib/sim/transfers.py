@@ -4,7 +4,8 @@
 
 - Nodes that no particle touches are neither cleared nor updated. ``spans`` (copies, 6, nodes^2) has the first and last
   in each row of the grid.
-- Grids of earlier steps are not kept. The reverse loop computes them again, which takes less time than the laws.
+- Of earlier steps only these nodes are kept, one after the other, if they are not more than the particles. Else the
+  reverse loop computes them again.
 - Contact and clamps are passes over the particles before and after the loops, with the functions of other devices.
   Clamped particles have no mass in ``mass_now``.
 """
@@ -17,6 +18,7 @@ import torch
 import warp as wp
 
 from neuma_lib.device import native_source, start_warp
+from neuma_lib.mechanics.singular_values_kernels import MATRICES
 from neuma_lib.sim.adjoint_kernels import adjoint_functions
 from neuma_lib.sim.clamp_kernels import clamp_functions, hold_type
 from neuma_lib.sim.contact_kernels import contact_functions, obstacle_type
@@ -25,6 +27,7 @@ from neuma_lib.sim.kernels import NO_CONTACT, forward_functions, grid_functions,
 start_warp()
 
 _TEXT = native_source(__file__, ".h")
+_TEXT["lanes"] = MATRICES + _TEXT["lanes"]
 
 
 def _native(dtype: torch.dtype, *parts: str, held: bool = False) -> str:
@@ -54,12 +57,19 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
     module = f"neuma_lib.sim.transfers_{str(dtype).removeprefix('torch.')}_{'_'.join(features)}"
     kernel = functools.partial(wp.kernel, enable_backward=False, module=module)
 
-    @wp.func_native(_native(dtype, "lanes", "block", "spans", "momentum", "p2g"))
+    @wp.func_native(_native(dtype, "lanes", "block", "spans", "keep", "momentum", "p2g"))
     def p2g_loop(
         c: GridConstants, x: wp.array(dtype=vec3), v: wp.array(dtype=vec3), C: wp.array(dtype=mat33),
         tau: wp.array(dtype=mat33), mass: wp.array(dtype=real), vol0: wp.array(dtype=real),
-        spans: wp.array(dtype=wp.int32), grid: wp.array2d(dtype=vec4),
+        spans: wp.array(dtype=wp.int32), grid: wp.array2d(dtype=vec4), kept: wp.array(dtype=vec4),
+        kept_spans: wp.array(dtype=wp.int32),
     ): ...  # fmt: skip
+
+    @wp.func_native(_native(dtype, "spans", "keep", "restore"))
+    def restore_nodes(
+        c: GridConstants, spans: wp.array(dtype=wp.int32), grid: wp.array2d(dtype=vec4), kept: wp.array(dtype=vec4),
+        kept_spans: wp.array(dtype=wp.int32),
+    ) -> wp.int32: ...  # fmt: skip
 
     @wp.func_native(_native(dtype, "grid_update"))
     def grid_loop(
@@ -74,7 +84,7 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         faults: wp.array2d(dtype=wp.int64),
     ): ...  # fmt: skip
 
-    @wp.func_native(_native(dtype, "trial"))
+    @wp.func_native(_native(dtype, "lanes", "trial"))
     def trial_loop(
         c: GridConstants, C_after: wp.array(dtype=mat33), F: wp.array(dtype=mat33), F_trial: wp.array(dtype=mat33)
     ): ...  # fmt: skip
@@ -132,7 +142,7 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
 
     @wp.func_native(_native(dtype, "lanes", "near"))
     def near_obstacles(
-        c: GridConstants, others: wp.int32, x: wp.array(dtype=vec3), v: wp.array(dtype=vec3),
+        c: GridConstants, others: wp.int32, again: wp.int32, x: wp.array(dtype=vec3), v: wp.array(dtype=vec3),
         radius: wp.array(dtype=real), v_now: wp.array(dtype=vec3), stuck: wp.array(dtype=vec3),
         near: wp.array(dtype=wp.int32),
     ) -> wp.int32: ...  # fmt: skip
@@ -148,6 +158,7 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         now: wp.int32,
         after: wp.int32,
         pose: wp.int32,
+        again: wp.int32,
         x: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
         radius_now: wp.array(dtype=real),
@@ -158,12 +169,12 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         near: wp.array(dtype=wp.int32),
         touching: wp.array(dtype=wp.int32),
     ):
-        """Velocities of the particles after contact with obstacles.
+        """Velocities of the particles after contact with obstacles, if one touches.
 
         Sets the particles that touch one, ``near[: touching[0]]``, in increasing order.
         """
         count = near_obstacles(
-            c, obstacles.shape[1] - c.faces, x[now], v[now], radius_now, v_now, stuck[after], near
+            c, obstacles.shape[1] - c.faces, again, x[now], v[now], radius_now, v_now, stuck[after], near
         )
         number = wp.int32(0)
         for q in range(count):
@@ -184,6 +195,8 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         c: GridConstants,
         now: wp.int32,
         stressed: wp.int32,
+        cached: wp.int32,
+        again: wp.int32,
         x: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
         C: wp.array2d(dtype=mat33),
@@ -191,14 +204,24 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         mass_now: wp.array(dtype=real),
         vol_now: wp.array(dtype=real),
         v_now: wp.array(dtype=vec3),
+        touching: wp.array(dtype=wp.int32),
         spans: wp.array(dtype=wp.int32),
         grids: wp.array2d(dtype=vec4),
+        kept: wp.array2d(dtype=vec4),
+        kept_spans: wp.array2d(dtype=wp.int32),
     ):
-        """As `kernels.p2g`, and clears all grids before."""
+        """As `kernels.p2g`, and clears all grids before. ``again``: from the nodes that the first time has kept, if it
+        has."""
+        if again == 1:
+            if restore_nodes(c, spans, grids, kept[cached], kept_spans[cached]) == 1:
+                return
+        v_p = v[now]
         if wp.static(contact):
-            p2g_loop(c, x[now], v_now, C[now], tau[stressed], mass_now, vol_now, spans, grids)
-        else:
-            p2g_loop(c, x[now], v[now], C[now], tau[stressed], mass_now, vol_now, spans, grids)
+            if touching[0] > 0:
+                v_p = v_now
+        p2g_loop(
+            c, x[now], v_p, C[now], tau[stressed], mass_now, vol_now, spans, grids, kept[cached], kept_spans[cached]
+        )  # fmt: skip
 
     @kernel
     def grid_update(
@@ -349,6 +372,7 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         mass_now: wp.array(dtype=real),
         vol_now: wp.array(dtype=real),
         v_now: wp.array(dtype=vec3),
+        touching: wp.array(dtype=wp.int32),
         grids: wp.array2d(dtype=vec4),
         grad_x: wp.array(dtype=vec3),
         grad_v: wp.array(dtype=vec3),
@@ -356,36 +380,13 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         grad_tau: wp.array(dtype=mat33),
     ):
         """As `adjoint_kernels.p2g_adjoint` without contact: grad_v is that of the velocity after it."""
+        v_p = v[now]
         if wp.static(contact):
-            p2g_adjoint_loop(
-                c,
-                x[now],
-                v_now,
-                C[now],
-                tau[stressed],
-                mass_now,
-                vol_now,
-                grids[2],
-                grad_x,
-                grad_v,
-                grad_C,
-                grad_tau,
-            )
-        else:
-            p2g_adjoint_loop(
-                c,
-                x[now],
-                v[now],
-                C[now],
-                tau[stressed],
-                mass_now,
-                vol_now,
-                grids[2],
-                grad_x,
-                grad_v,
-                grad_C,
-                grad_tau,
-            )
+            if touching[0] > 0:
+                v_p = v_now
+        p2g_adjoint_loop(
+            c, x[now], v_p, C[now], tau[stressed], mass_now, vol_now, grids[2], grad_x, grad_v, grad_C, grad_tau
+        )  # fmt: skip
 
     @kernel
     def touch_adjoint_kernel(

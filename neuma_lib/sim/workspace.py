@@ -94,6 +94,7 @@ class Workspace:
         grad_*: gradients of the above for one step, without the first axis. grad_grid has two sides that steps
             use alternately.
         law_caches: caches of the laws, kept here so that the next rollout can overwrite them.
+        loop: `SegmentLoop` of the last rollout on a CPU, and its arguments.
         weights, grad_weights: weights of the laws and their gradients at fixed addresses, for the graphs.
         graphs: recorded loops over these buffers.
         native: the transfers of a CPU, or None. Its steps share a grid, and gradients of the nodes have one side.
@@ -103,6 +104,7 @@ class Workspace:
         self.size = size
         self._views: dict[int, wp.array] = {}
         self.law_caches: dict[tuple, Any] = {}
+        self.loop: tuple[Any, Any] | None = None
         self.graphs = GraphCache()
         self.weights: list[Tensor] = []
         self.grad_weights: list[Tensor] = []
@@ -275,10 +277,10 @@ class Workspace:
         if not self.native and self.size.n_cached_steps > 1:
             self.grid.zero_()
 
-    def transfer_to_grid(self, step: int) -> None:
-        """From tau and the state of a step to the velocities of the nodes."""
+    def transfer_to_grid(self, step: int, again: bool = False) -> None:
+        """From tau and the state of a step to the velocities of the nodes, ``again`` in the reverse loop."""
         if self.native:
-            self.native.run("to_grid", step)
+            self.native.run("to_grid_again" if again else "to_grid", step)
             return
         cached = self.cached_at(step)
         if self.size.n_cached_steps == 1:  # else `start_segment` clears those of all steps at once
