@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,7 +20,7 @@ from neuma_lib.fitting.identified import FamilyFit
 from neuma_lib.fitting.least_squares import (
     MIN_COST,
     Linearisation,
-    in_blocks,
+    block_sums,
     jackknife,
     levenberg_marquardt,
     secant_update,
@@ -27,8 +28,7 @@ from neuma_lib.fitting.least_squares import (
 from neuma_lib.fitting.video_residuals import MOTION, NUISANCES, Candidate, VideoResiduals, averaged
 from neuma_lib.mechanics.combinations import Values
 
-_LAST_GAIN = 0.1  # factor on `min_gain` at the last level
-_CLOSE_GAIN = 1e-3  # the same of fits that are compared
+_LAST_GAIN = 0.1  # factor on `min_gain` at the last level, unless the fit is rough
 _EXCLUDED = 2.0  # standard deviations at which a Coulomb coefficient is excluded
 _FRICTIONS, _FRICTION_FACTOR = 8, 2.0  # coefficients that are tried together, and their ratio
 _MIN_LOSS = 1e-12  # held-out loss of images that agree exactly
@@ -82,6 +82,12 @@ class FamilyRun:
         return self._u[self._constants :]
 
     @property
+    def columns(self) -> list[list[Tensor]]:
+        """Derivatives by the constants at the end of the fit."""
+        (columns,) = self._columns.values()
+        return columns
+
+    @property
     def loss(self) -> float:
         """Mean squared residual at the current level, infinite without a simulation."""
         return self.fit.rms**2 if self.fit else math.inf
@@ -98,8 +104,15 @@ class FamilyRun:
         level: int = 0,
         deviations: np.ndarray | None = None,
         below: float = math.inf,
+        like: Iterable[FamilyRun] = (),
+        **how: Any,
     ) -> None:
-        """Fit at a level from the best of some starts, if its squared residuals are below a limit."""
+        """Fit at a level from the best of some starts, if its squared residuals are below a limit.
+
+        Args:
+            like: fits to the same frames. This one begins with the derivatives of the first with the same constants.
+            how: options of `refine`.
+        """
         self._level = level
         unique = {tuple(values.values()): values for values in starts}
         origins = [self.family.unbounded(values) for values in unique.values()]
@@ -112,7 +125,10 @@ class FamilyRun:
         self.alive = costs[best] < below
         if self.alive:
             self._origin, self._images = origins[best], {self._u.tobytes(): residuals[best]}
-            self.refine(level)
+            similar = [run for run in like if run.family.constants == self.family.constants]
+            if similar:
+                self._columns, self._exact = {self._u.tobytes(): similar[0].columns}, False
+            self.refine(level, **how)
 
     def restart_from(self, values: Values) -> None:
         """Continue from the constants of another family if they have a lower cost."""
@@ -121,18 +137,25 @@ class FamilyRun:
             self._u = unknowns
             self.refine(self._level)
 
-    def refine(self, level: int, closely: bool = False) -> None:
-        """Continue the fit at a level of the pyramid, ``closely`` until its constants are comparable between grids."""
+    def refine(self, level: int, rough: bool = False, limit: float = math.inf) -> None:
+        """Continue the fit at a level of the pyramid.
+
+        Args:
+            rough: end early, with derivatives that have been updated, as always before the last level.
+            limit: cost beyond which the fit is given up.
+        """
         self._level, last = level, level == len(self.settings.pyramid) - 1
         self._u, self.fit, steps = levenberg_marquardt(
             self,
             self._u,
             self._free,
             self._prior,
-            self.settings.min_gain * (_CLOSE_GAIN if closely else _LAST_GAIN if last else 1.0),
+            self.settings.min_gain * (1.0 if rough or not last else _LAST_GAIN),
             self.settings.iterations,
             longest=self.settings.longest_step,
             secant=True,
+            rough=rough or not last,
+            limit=limit,
         )
         self.steps += steps
         self.refined = last
@@ -260,12 +283,11 @@ class FamilyRun:
         for at, r in enumerate(averages):
             columns = self._columns_of(at)
             own = [i for i in free if i in columns]
-            J = torch.stack([in_blocks(self._averaged(at, columns[i])) for i in own], dim=-1).double()
-            blocks = in_blocks(r).double()
-            curvatures.append(np.zeros((len(J), k, k)))
-            scores.append(np.zeros((len(J), k)))
-            curvatures[at][:, np.array(own)[:, None], own] = (J.mT @ J).cpu().numpy()
-            scores[at][:, own] = (J.mT @ blocks[..., None])[..., 0].cpu().numpy()
+            curvature, score = block_sums([self._averaged(at, columns[i]) for i in own], r)
+            curvatures.append(np.zeros((len(curvature), k, k)))
+            scores.append(np.zeros((len(score), k)))
+            curvatures[at][:, np.array(own)[:, None], own] = curvature
+            scores[at][:, own] = score
         cost = self._cost(residual)
         # With the weights, every video counts like the number of residuals of the first one.
         first = sum(r.numel() for r, (v, *_) in zip(averages, self._places, strict=True) if v == 0)
@@ -276,7 +298,7 @@ class FamilyRun:
 
     def _columns_of(self, at: int) -> dict[int, Tensor]:
         """Derivatives of the residuals of an observation by the unknowns of its video, at the current fit."""
-        (by_constants,), (v, k, rows) = self._columns.values(), self._places[at]
+        by_constants, (v, k, rows) = self.columns, self._places[at]
         own = zip(self._unsure(v), [each[k] for each in self.videos[v].by_deviation or ()], strict=False)
         return {i: column[:rows] for i, column in (*enumerate(c[at] for c in by_constants), *own)}
 

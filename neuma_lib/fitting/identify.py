@@ -107,8 +107,12 @@ def identify(
     published_values = _constants(published) if published else {}
     running: list[FamilyRun] = []
     rounds = len(settings.pyramid)
+    late = []
     for family in families:
-        running.append(_first_fit(family, videos, running, published_values, settings))
+        if any(_is_near(family, run.family) for run in running):
+            late.append(family)
+        else:
+            running.append(_first_fit(family, videos, running, published_values, settings))
     for run, best in _better_later(running):
         run.restart_from(run.family.with_guesses({**run.values, **best.values}))
     total = rounds * len(families)
@@ -118,9 +122,14 @@ def identify(
         if following and level == rounds - 1:
             following[0].differentiate()
         for done, run in enumerate(following):
-            run.refine(level)
+            run.refine(level, rough=bool(refined))
             if progress:
                 progress(level * len(families) + done + 1, total, run.loss)
+        if level >= rounds - 2:
+            running += [
+                _late_fit(family, videos, running, settings, level, rough=bool(refined)) for family in late
+            ]
+            late = []
     fits = {run.family.name: run.score() for run in running}
     _log_fits(fits.values(), "", log)
     compared, fine = fits, {}
@@ -151,12 +160,10 @@ def identify(
         final.begin(start[:1], rounds - 1, start[1])
     material = None
     if name in fine and fine[name].alive and final.alive:
-        final.refine(rounds - 1, closely=True)
         whole = FamilyRun(final.family, videos, counts, settings, fine=True)
         starts = [{key: each[key] for key in final.values} for each in (fine[name].values, final.values)]
-        whole.begin(starts, rounds - 1, final.deviations)
+        whole.begin(starts[: 2 if first == 0 else 1], rounds - 1, final.deviations, like=[final])
         if whole.alive:
-            whole.refine(rounds - 1, closely=True)
             material = _final_fit(whole, selected, [compared[tie] for tie in ties])
     best = _final_fit(final, fits[name], [fits[tie] for tie in ties])
     best.lowest_friction = lowest
@@ -187,19 +194,31 @@ def _on_finer_grid(
     They are of at most `_CONTENDERS` families whose held-out loss is at most ``prune_factor`` times the lowest, and of
     the best family with each return map whose held-out loss is at most the square of it.
 
-    Images of the finer grid may differ by more than a pixel, hence the fit at the coarsest level first.
+    Images of the finer grid may differ by more than a pixel, hence the fit at the coarsest level first, unless a near
+    family has been fitted there. Derivatives are those of the coarse grid until a step fails.
     """
     ranked = sorted((run for run in running if run.alive), key=lambda run: fits[run.family.name].score)
     lowest, factor = fits[ranked[0].family.name].score if ranked else 0.0, math.log(settings.prune_factor)
     excess = {run: fits[run.family.name].score - lowest for run in ranked}
     first = {run.family.return_map: run for run in reversed(ranked)}
     close = [run for run in ranked[:_CONTENDERS] if excess[run] <= factor]
-    fine = {}
-    for run in dict.fromkeys([*close, *(run for run in first.values() if excess[run] <= 2 * factor)]):
+    contenders = dict.fromkeys([*close, *(run for run in first.values() if excess[run] <= 1.5 * factor)])
+    flowing, last = [run for run in contenders if run.family.flows], len(settings.pyramid) - 1
+    fine: dict[str, FamilyRun] = {}
+    for run in sorted(contenders, key=lambda run: len(run.family.constants)):
+        if _is_redundant(run, flowing):
+            continue
         again = FamilyRun(run.family, videos, [video.fitted for video in videos], settings, fine=True)
-        again.begin([run.values], 0, run.deviations)
-        if again.alive:
-            again.refine(len(settings.pyramid) - 1)
+        done = [each for each in fine.values() if each.alive]
+        near = [each for each in done if _is_near(run.family, each.family)]
+        if near:
+            starts = [run.family.with_guesses({**run.values, **each.values}) for each in near]
+            again.begin(starts, last, near[0].deviations, like=[run], rough=True)
+        else:
+            again.begin([run.values], 0, run.deviations, like=[run])
+            if again.alive:
+                limit = settings.prune_factor * min((each.fit.cost for each in done), default=math.inf)
+                again.refine(last, rough=True, limit=limit)
         fine[run.family.name] = again
     return fine
 
@@ -252,6 +271,26 @@ def _first_fit(
     return best
 
 
+def _is_near(family: Family, other: Family) -> bool:
+    """Whether the fit of another family is near one of this: it has the same constants, or flows and is a limit."""
+    return family.constants == other.constants or other.flows and family.contains(other)
+
+
+def _late_fit(
+    family: Family,
+    videos: Sequence[VideoResiduals],
+    running: Sequence[FamilyRun],
+    settings: IdentifyConfig,
+    level: int,
+    rough: bool,
+) -> FamilyRun:
+    """Fit of a family at a level from those of near families."""
+    near = [run for run in running if _is_near(family, run.family)]
+    run = FamilyRun(family, videos, [video.fitted for video in videos], settings)
+    run.begin([family.with_guesses(other.values) for other in near], level, like=near, rough=rough)
+    return run
+
+
 def _better_later(running: Sequence[FamilyRun]) -> list[tuple[FamilyRun, FamilyRun]]:
     """Pairs of a fit and a better one that started later: the best of all, and the best with the same constants."""
     ranked, pairs = sorted((run for run in running if run.alive), key=lambda run: run.fit.cost), []
@@ -263,16 +302,18 @@ def _better_later(running: Sequence[FamilyRun]) -> list[tuple[FamilyRun, FamilyR
 
 
 def _prune(running: Sequence[FamilyRun], settings: IdentifyConfig, keep_redundant: bool = False) -> None:
-    """Drop redundant families, and those whose loss exceeds ``prune_factor`` times the best with their return map.
+    """Drop redundant families, and those whose loss exceeds ``prune_factor`` times the best with their return map, or
+    the square of it times the best of all.
 
-    Return maps are not compared, because the error of a coarse grid, at thin limbs and near the floor, is like plastic
-    flow. Families that do not improve on a simpler one at a coarse level are kept, since finer levels have more
+    Return maps are hardly compared, because the error of a coarse grid, at thin limbs and near the floor, is like
+    plastic flow. Families that do not improve on a simpler one at a coarse level are kept, since finer levels have more
     information, and redundant ones with ``keep_redundant``, for a finer grid.
     """
     alive = [run for run in running if run.alive]
+    best = min((run.fit.cost for run in alive), default=math.inf)
     for run in alive:
         lowest = min(other.fit.cost for other in alive if other.family.return_map == run.family.return_map)
-        run.alive = run.fit.cost <= settings.prune_factor * lowest
+        run.alive = run.fit.cost <= min(settings.prune_factor * lowest, settings.prune_factor**2 * best)
     kept = [run for run in alive if run.alive]
     for run in [] if keep_redundant else [run for run in kept if _is_redundant(run, kept)]:
         run.alive = False

@@ -5,6 +5,7 @@ Images are reduced to sums J^T J and J^T r per block, so that blocks can be left
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -19,6 +20,9 @@ MIN_COST = 1e-12
 """Lower bound of the cost, so that exact agreement does not make the equations singular."""
 _MIN_SHARE = 1e-6  # share of the curvature of a block that shows the body
 _FIRST_DAMPING, _MIN_DAMPING, _MAX_DAMPING = 1e-3, 1e-9, 1e6
+_SECANT_DAMPING = 0.03  # at least, with an updated J, which is inaccurate where the images change little
+_FAILED_DAMPING, _DAMPING_FACTOR = 0.5, 16.0  # at least, and its growth, after a step that fails
+_ROUGH_GAIN = 0.05  # predicted relative gain of a failed step that ends a rough fit
 
 
 @dataclass(frozen=True)
@@ -66,13 +70,30 @@ class Residuals(Protocol):
         may be updated from that at a former point."""
 
 
-def in_blocks(values: Tensor) -> Tensor:
-    """Values (T, V, H, W, C) grouped by block of the image, shape (V * blocks, values)."""
-    T, V, H, W, C = values.shape
+def block_sums(columns: Sequence[Tensor], residual: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    """J^T J and J^T r of every block of the image, summed over frames, shapes (V * blocks, k, k) and (V * blocks, k).
+
+    Only pixels that depend on an unknown are summed, since most show the background.
+
+    Args:
+        columns: the k columns of J, shape (T, V, H, W, C) each.
+        residual: r, of the same shape.
+    """
+    V, H, W, C = residual.shape[1:]
     tall, wide = -(-H // BLOCKS), -(-W // BLOCKS)
-    full = torch.nn.functional.pad(values, (0, 0, 0, wide * BLOCKS - W, 0, tall * BLOCKS - H))
-    split = full.reshape(T, V, BLOCKS, tall, BLOCKS, wide, C)
-    return split.permute(1, 2, 4, 0, 3, 5, 6).reshape(V * BLOCKS**2, T * tall * wide * C)
+    depends = torch.zeros(residual.shape[:-1], dtype=torch.bool, device=residual.device)
+    for column in columns:
+        depends |= (column != 0).any(dim=-1)
+    t, v, y, x = depends.nonzero(as_tuple=True)
+    block = (v * BLOCKS + y // tall) * BLOCKS + x // wide
+    order = block.argsort(stable=True)
+    sizes = (C * block.bincount(minlength=V * BLOCKS**2)).tolist()
+    at = (t[order], v[order], y[order], x[order])
+    J = torch.stack([column[at].flatten() for column in columns], dim=-1).double().split(sizes)
+    r = residual[at].flatten().double().split(sizes)
+    curvatures = torch.stack([own.mT @ own for own in J])
+    scores = torch.stack([own.mT @ values for own, values in zip(J, r, strict=True)])
+    return curvatures.cpu().numpy(), scores.cpu().numpy()
 
 
 def levenberg_marquardt(
@@ -85,6 +106,8 @@ def levenberg_marquardt(
     progress: Callable[[int, int, float], None] | None = None,
     longest: float | None = None,
     secant: bool = False,
+    rough: bool = False,
+    limit: float = math.inf,
 ) -> tuple[np.ndarray, Linearisation, int]:
     """Minimise |r(u)|^2 + u^T P u over the free unknowns.
 
@@ -93,18 +116,22 @@ def levenberg_marquardt(
         start: initial unknowns, shape (k,).
         free: indices of the free unknowns.
         penalty: P, shape (k, k), from the linearised problem.
-        min_gain: minimum predicted relative decrease of the cost in a step.
+        min_gain: minimum predicted relative decrease of the cost in a step. Steps that fail are shortened until they
+            predict less, since the cost is not smoother than that.
         iterations: maximum number of attempted steps.
         progress: called with (step, steps, rms).
         longest: largest change of an unknown in a step, None for no limit.
-        secant: whether J may be updated instead of differentiated after a step. It is differentiated again after a
-            step that fails, and before the result.
+        secant: whether J may be updated instead of differentiated, at the start from a former fit. It is differentiated
+            after a step that fails, and before the result.
+        rough: whether the result may have an updated J, also after a failed step that predicted little.
+        limit: cost beyond which a predicted minimum is of no interest. The fit ends there.
 
     Returns:
         The unknowns (k,), the linearisation there in the free ones, and the number of accepted steps.
     """
-    u, damping, accepted = start, _FIRST_DAMPING, 0
-    fit = residuals.linearise(u, free)
+    u, accepted = start, 0
+    damping, lowest = (_SECANT_DAMPING,) * 2 if secant else (_FIRST_DAMPING, _MIN_DAMPING)
+    fit = residuals.linearise(u, free, exact=not secant)
     for iteration in range(iterations):
         P = penalty(fit)
         A, slope = (fit.curvature + P)[np.ix_(free, free)], (fit.slope + P @ u)[free]
@@ -112,25 +139,30 @@ def levenberg_marquardt(
         step[free] = -np.linalg.solve(A + damping * np.diag(np.diag(A)), slope)
         if longest is not None:
             step *= min(1.0, longest / max(np.abs(step).max(), MIN_COST))
-        if slope @ np.linalg.solve(A, slope) < min_gain * max(fit.cost, MIN_COST):
-            if fit.exact:
+        if fit.cost - slope @ np.linalg.solve(A, slope) > limit:
+            break
+        gain = -(2 * slope + A @ step[free]) @ step[free] / max(fit.cost, MIN_COST)
+        if gain < min_gain:
+            if fit.exact or rough:
                 break
             fit = residuals.linearise(u, free)
             continue
         trial = u + step
         before, after = fit.cost + u @ P @ u, residuals.cost(trial) + trial @ P @ trial
         if after < before:
-            u, damping, accepted = trial, max(damping / 5, _MIN_DAMPING), accepted + 1
+            u, damping, accepted = trial, max(damping / 5, lowest), accepted + 1
             fit = residuals.linearise(u, free, exact=not secant)
         elif fit.exact:
-            damping *= 8
+            damping = max(_FAILED_DAMPING, _DAMPING_FACTOR * damping)
+        elif rough and gain < _ROUGH_GAIN:
+            break
         else:
             fit = residuals.linearise(u, free)
         if progress:
             progress(iteration + 1, iterations, fit.rms)
         if damping > _MAX_DAMPING:
             break
-    if not fit.exact:
+    if not (fit.exact or rough or fit.cost > limit):
         fit = residuals.linearise(u, free)
     return u, fit, accepted
 

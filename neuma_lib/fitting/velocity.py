@@ -34,7 +34,7 @@ from neuma_lib.coupling.filmed import Filmed
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.fitting.frame_batches import frame_batches, spread_frames
-from neuma_lib.fitting.least_squares import Linearisation, in_blocks, jackknife, levenberg_marquardt
+from neuma_lib.fitting.least_squares import Linearisation, block_sums, jackknife, levenberg_marquardt
 from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.model import MPM, contact_clearance
 from neuma_lib.sim.rollout import rollout
@@ -327,15 +327,15 @@ class _Residuals:
             curvatures, scores = 0.0, 0.0
             for part in self._parts(video):
                 r = self._residual(unknowns, video, part)
-                columns = torch.zeros(*in_blocks(r).shape, UNKNOWNS).to(r)  # (blocks, pixels, 11)
+                columns = [torch.zeros_like(r)] * UNKNOWNS
                 for k in free:
                     e = self.difference * np.eye(UNKNOWNS)[k]
                     change = self._render(unknowns + e, video, part) - self._render(unknowns - e, video, part)
-                    columns[..., k] = in_blocks(change / (2 * self.difference))
+                    columns[k] = change / (2 * self.difference)
                 cost, count = cost + r.square().sum().double(), count + r.numel()
-                curvatures = curvatures + (columns.mT @ columns).double()
-                scores = scores + (columns.mT @ in_blocks(r)[..., None])[..., 0].double()
-            sums.append((curvatures.cpu().numpy(), scores.cpu().numpy()))
+                curvature, score = block_sums(columns, r)
+                curvatures, scores = curvatures + curvature, scores + score
+            sums.append((curvatures, scores))
         cost = self._checked(cost, unknowns)
         curvatures, scores = (np.concatenate(of_all) for of_all in zip(*sums, strict=True))
         return Linearisation(curvatures, scores, cost, float(np.sqrt(cost / count)))

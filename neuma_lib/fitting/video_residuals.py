@@ -8,7 +8,7 @@ shorter time steps and more particles, may be simulated instead.
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -23,9 +23,11 @@ from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.fitting.families import Family
 from neuma_lib.fitting.frame_batches import first_contact, frame_batches, held_out_frames, spread_frames
 from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.batch import rollout_batch
 from neuma_lib.sim.model import MPM
-from neuma_lib.sim.state import Trajectory
+from neuma_lib.sim.rigid_flight import is_rigid, rigid_flight
+from neuma_lib.sim.state import State, Trajectory
 from neuma_lib.splatting.observation import Observation, joint_frames, rendered_steps, several
 from neuma_lib.threads import in_threads
 
@@ -33,6 +35,7 @@ MOTION = 6
 """Number of unknowns of an initial motion: velocity and spin."""
 NUISANCES = 9
 """`MOTION`, and shift right, shift down and enlargement of the rendered body."""
+_KEPT = 4  # flights of different motions, and their images
 
 
 @dataclass(frozen=True)
@@ -98,8 +101,15 @@ class VideoResiduals:
         self._pose_tolerance = settings.pose_tolerance
         self._total, self._axes = settings.covariance_from == "total", observed[0].cameras.viewmats[0, :3, :3]
         self._steps, self._own_frames = rendered_steps(observed), [each.frames for each in observed]
+        self._ends = [[f + each.exposure[-1] for f in each.frames] for each in observed]
+        self._flights: dict[tuple[bool, bytes], Trajectory] = {}
+        self._flown: dict[tuple[bool, bytes, int, int], Tensor] = {}
         self._last = [  # step at which the last exposure of the frames up to each ends
-            max(f + each.exposure[-1] for each in observed for f in each.frames if f <= n)
+            max(
+                ends[bisect_right(each.frames, n) - 1]
+                for each, ends in zip(observed, self._ends, strict=True)
+                if each.frames[0] <= n
+            )
             for n in self.frames
         ]
 
@@ -148,7 +158,7 @@ class VideoResiduals:
     def hold_out(self, family: Family, share: float) -> None:
         """Hold out the last share of the frames after the first contact, whose time is the same for any law."""
         law = family.law_spec(family.values(family.unbounded(family.guess), self.model, self.density))
-        (path,) = self._paths([Candidate(law, np.zeros(NUISANCES))], len(self.frames), self._coarse)
+        (path,), _ = self._paths([Candidate(law, np.zeros(NUISANCES))], len(self.frames), self._coarse)
         vol0 = self._coarse.body.vol0
         contact = 0 if path is None else first_contact(self.model, path.at(self.frames).x, vol0, self.frames)
         self.fitted = held_out_frames(len(self.frames), share, contact=contact)[0]
@@ -162,17 +172,18 @@ class VideoResiduals:
             fine: simulate the refined body on the finer grid.
         """
         on = self._fine if fine else self._coarse
-        return self._residuals(candidates, self._paths(candidates, count, on), on, count)
+        return self._residuals(candidates, *self._paths(candidates, count, on), on, count)
 
     def differentiate(self, at: Candidate) -> None:
         """Compute the derivatives by the deviations as forward differences, 0 where a rollout diverges."""
         varied = [replace(at, deviations=at.deviations + step) for step in np.eye(NUISANCES)[self.unsure]]
         simulated = [at, *(one for one, k in zip(varied, self.unsure, strict=True) if k < MOTION)]
         count = len(self.frames)
-        paths = self._paths(simulated, count, self._coarse)
+        paths, flown = self._paths(simulated, count, self._coarse)
         # Shift and enlargement of the rendered body need no rollout.
-        paths += [paths[0]] * (1 + len(varied) - len(simulated))
-        base, *others = self._residuals([at, *varied], paths, self._coarse, count)
+        more = 1 + len(varied) - len(simulated)
+        paths, flown = paths + paths[:1] * more, flown + flown[:1] * more
+        base, *others = self._residuals([at, *varied], paths, flown, self._coarse, count)
         if base is not None:  # otherwise it diverges after the fitted frames
             self.by_deviation = [
                 [torch.zeros_like(r) for r in base] if each is None else _differences(each, base)
@@ -181,8 +192,9 @@ class VideoResiduals:
 
     def _paths(
         self, candidates: Sequence[Candidate], count: int, on: _Discretisation
-    ) -> list[Trajectory | None]:
-        """Rollouts to the end of the exposure of the first ``count`` frames, which are steps of the coarse grid."""
+    ) -> tuple[list[Trajectory | None], list[int]]:
+        """Rollouts to the end of the exposure of the first ``count`` frames, which are steps of the coarse grid, and
+        the number of their states in rigid flight."""
         self.rollouts += len(candidates)
         frames = self._steps[: bisect_right(self._steps, self._last[count - 1])]
         starts = [self.motion.moved(one.deviations[:MOTION]).of_body(on.body) for one in candidates]
@@ -190,46 +202,88 @@ class VideoResiduals:
         models = [
             on.model if one.friction is None else on.model.with_friction(one.friction) for one in candidates
         ]
-        substeps = round(self.model.dt / on.model.dt)
-        options = dict(steps=substeps * frames[-1], frames=[substeps * n for n in frames], total=self._total)
-        paths = rollout_batch(models, laws, starts, **options)
-        return [path and replace(path, frames=tuple(frames)) for path in paths]
+        flights = [self._flight(on, *each) for each in zip(candidates, laws, starts, strict=True)]
+        substeps, paths = round(self.model.dt / on.model.dt), [None] * len(candidates)
+        for flown in {len(flight.frames) for flight in flights}:
+            own = [i for i, flight in enumerate(flights) if len(flight.frames) == flown]
+            flown = min(flown, len(frames) - 1)
+            first = frames[flown - 1] if flown else 0
+            later = [substeps * (n - first) for n in frames[flown:]]
+            simulated = rollout_batch(
+                [models[i] for i in own],
+                [laws[i] for i in own],
+                [starts[i].after(flights[i], flown - 1) if flown else starts[i] for i in own],
+                steps=later[-1],
+                frames=later,
+                total=self._total,
+            )
+            for i, path in zip(own, simulated, strict=True):
+                path = path and replace(path, frames=tuple(frames[flown:]))
+                paths[i] = flights[i].first(flown).followed_by(path) if path and flown else path
+        return paths, [len(flight.frames) for flight in flights]
+
+    def _flight(self, on: _Discretisation, one: Candidate, law: Law, start: State) -> Trajectory:
+        """States before the first contact of a spinning body that its law keeps rigid, without frames if there are
+        none."""
+        key = (on is self._fine, one.deviations[:MOTION].tobytes())
+        if key not in self._flights:
+            substeps = round(self.model.dt / on.model.dt)
+            flight = rigid_flight(on.model, start, [substeps * n for n in self._steps], self._total)
+            clear = first_contact(on.model, flight.x, start.vol0, flight.frames)
+            flight = replace(flight, frames=self._steps)
+            self._flights = {**dict(list(self._flights.items())[-_KEPT:]), key: flight.first(clear)}
+        changes = on.model.changes or on.model.clamps
+        rigid = start.C.any() and not changes and is_rigid(law, start)
+        return self._flights[key].first(len(self._steps) if rigid else 0)
 
     def _residuals(
         self,
         candidates: Sequence[Candidate],
         paths: Sequence[Trajectory | None],
+        flown: Sequence[int],
         on: _Discretisation,
         count: int,
     ) -> list[list[Tensor] | None]:
         """Residuals of the candidates, on a CPU in threads, with the same results for any number."""
 
-        def residual(pair: tuple[Candidate, Trajectory | None]) -> list[Tensor] | None:
-            return self._residual(*pair, on.films, count)
+        def residual(each: tuple[Candidate, Trajectory | None, int]) -> list[Tensor] | None:
+            return self._residual(*each, on, count)
 
         threads = None if on.body.x0.device.type == "cpu" else 1
-        return in_threads(residual, list(zip(candidates, paths, strict=True)), on.kernels, threads)
+        return in_threads(residual, list(zip(candidates, paths, flown, strict=True)), on.kernels, threads)
 
     @torch.no_grad()
     def _residual(
-        self, one: Candidate, path: Trajectory | None, filmed: Sequence[Filmed], count: int
+        self, one: Candidate, path: Trajectory | None, flown: int, on: _Discretisation, count: int
     ) -> list[Tensor] | None:
+        """Residuals of a candidate. Images of rigid flight are kept, because they are the same for all laws."""
         if path is None:
             return None
         right, down, enlargement = (self._pose_tolerance * one.deviations[MOTION:]).tolist()
-        residuals = []
-        for films, observed, size, T in zip(
-            filmed, self._observed, self._finest, self.counts(count), strict=True
-        ):
-            images = []
-            for part in frame_batches(T, films.batch) if T else ():
+        residuals, counts = [], self.counts(count)
+        for k, (films, observed, size) in enumerate(zip(on.films, self._observed, self._finest, strict=True)):
+            first = min(bisect_right(self._ends[k], self._steps[flown - 1]), counts[k]) if flown else 0
+            key = (on is self._fine, one.deviations.tobytes(), k, first)
+            images = [self._flown[key]] if key in self._flown else []
+            parts = [] if images else [*_parts(0, first, films.batch)]
+            for part in [*parts, *_parts(first, counts[k], films.batch)]:
                 x = films.states(path.x, part)
                 centre = x.mean(dim=-2, keepdim=True)
                 x = centre + (1 + enlargement) * (x - centre)
                 x = x + right * self._axes[0] + down * self._axes[1]
                 images.append(averaged(films(x, (1 + enlargement) * films.states(path.stretch, part)), size))
-            residuals.append(self.weight * (torch.cat([*images, observed[:0]]) - observed[:T]))
+            if parts:
+                kept = {key: torch.cat(images[: len(parts)])}
+                self._flown = {**dict(list(self._flown.items())[-_KEPT:]), **kept}
+            residuals.append(self.weight * (torch.cat([*images, observed[:0]]) - observed[: counts[k]]))
         return residuals if all(bool(residual.isfinite().all()) for residual in residuals) else None
+
+
+def _parts(first: int, last: int, size: int) -> Iterator[slice]:
+    """Batches of at most ``size`` of the frames from ``first`` up to ``last``."""
+    if first < last:
+        for part in frame_batches(last - first, size):
+            yield slice(first + part.start, first + part.stop)
 
 
 def _differences(these: Sequence[Tensor], those: Sequence[Tensor]) -> list[Tensor]:

@@ -179,6 +179,10 @@ class Trajectory:
         path = replace(self._each(lambda value: value[[index[n] for n in reached]]), frames=reached)
         return path.hold_last(len(frames) - len(reached)) if len(reached) < len(frames) else path
 
+    def first(self, count: int) -> Trajectory:
+        """The states at the first ``count`` frames."""
+        return replace(self._each(lambda value: value[:count]), frames=self.frames[:count])
+
     @property
     def stretch(self) -> Tensor:
         """Deformation of Gaussians, shape (T, N, 3, 3): the total deformation if available, else F."""
