@@ -158,6 +158,8 @@ def identify(
         if whole.alive:
             whole.refine(rounds - 1, closely=True)
             material = _final_fit(whole, selected, [compared[tie] for tie in ties])
+    if refined and material is None:
+        log(f"{name}: no constants of the material, because no simulation on the finer grid is finite")
     best = _final_fit(final, fits[name], [fits[tie] for tie in ties])
     best.lowest_friction = lowest
     if material is not None:
