@@ -165,6 +165,8 @@ def identify(
         whole.begin(starts[: 2 if first == 0 else 1], rounds - 1, final.deviations, like=[final])
         if whole.alive:
             material = _final_fit(whole, selected, [compared[tie] for tie in ties])
+    if refined and material is None:
+        log(f"{name}: no constants of the material, because no simulation on the finer grid is finite")
     best = _final_fit(final, fits[name], [fits[tie] for tie in ties])
     best.lowest_friction = lowest
     if material is not None:

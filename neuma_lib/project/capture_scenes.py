@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -15,12 +16,19 @@ from neuma_lib.io.files import one_line
 from neuma_lib.project.capture_folder import Capture, capture_folders, read_capture
 from neuma_lib.project.released_captures import released_captures
 
+_LOGGER = logging.getLogger(__name__)
+
+
+def warn_of_missing_scenes(error: InputError) -> None:
+    """Warn that a capture has no scenes."""
+    _LOGGER.warning("a capture has no scenes: %s", error)
+
 
 def captured_scenes(
     root: str | Path,
     released: Mapping[str, ReleasedConfig] | None = None,
     planned: Mapping[str, Capture] | None = None,
-    log: Callable[[InputError], None] = lambda error: None,
+    log: Callable[[InputError], None] = warn_of_missing_scenes,
 ) -> dict[str, dict[str, Any]]:
     """Settings of the scenes of all captures in a folder, of released and of planned captures, by name.
 
@@ -29,7 +37,7 @@ def captured_scenes(
 
     Args:
         log: called for each capture, released or in the folder, that has no scenes, because it cannot be read or they
-            are those of another capture. Targets that need it are refused by its own rules.
+            are those of another capture. Targets that need it are refused by its own rules. By default a warning.
     """
     scenes: dict[str, dict[str, Any]] = {}
     for capture in (planned or {}).values():

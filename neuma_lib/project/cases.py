@@ -46,8 +46,7 @@ class ProjectCase(Case):
 
     @property
     def prior_law(self) -> dict[str, Any] | None:
-        law = self.settings.priors.laws.get(self.prior)
-        return law.plain() if law else None
+        return published_law(self.settings, self.prior)
 
     @property
     def scene_law(self) -> dict[str, Any]:
@@ -114,6 +113,12 @@ class ProjectCase(Case):
         dt = self.settings.scene(self.scene).dt
         module = type(self.method).__module__
         return ModelSource(module, self.method.model_options(self), self.method.model_inputs(self), dt)
+
+
+def published_law(settings: Config, prior: str) -> dict[str, Any] | None:
+    """The analytic law that a prior is trained on. None if the prior is a file of the user."""
+    law = settings.priors.laws.get(prior)
+    return law.plain() if law else None
 
 
 def preset(settings: Config, method: str) -> tuple[PresetConfig, dict[str, Any]]:

@@ -60,6 +60,11 @@ def _section_errors(settings: Config, root: str | Path) -> Iterator[InputError]:
         if all(body.scene in settings.scenes for body in experiment.bodies):
             yield from _raised_by(settings.experiment_truth, name)
     yield from _sampling_errors(settings)
+    for name, table in settings.tables.items():
+        drawn = [scene for scene in table.scenes if scene.startswith(settings.random.prefix)]
+        if drawn and settings.random.is_development:
+            problem = f"{drawn[0]} is of a seed for development (random.development_seeds)"
+            yield InputError(f"tables.{name}.scenes", problem, "Choose another random.seed")
 
 
 def _name_errors(settings: Config) -> Iterator[InputError]:

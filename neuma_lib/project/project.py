@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from neuma_lib.errors import InputError
 from neuma_lib.io.files import existing, write_text
-from neuma_lib.project.capture_scenes import captured_scenes
+from neuma_lib.project.capture_scenes import captured_scenes, warn_of_missing_scenes
 from neuma_lib.project.loading import load, load_captures, merged, read_yaml
 from neuma_lib.project.settings import Config
 
@@ -66,7 +66,7 @@ class Project(NamedTuple):
         cls,
         place: str | Path,
         configfiles: Sequence[str | Path] = (),
-        log: Callable[[InputError], None] = lambda error: None,
+        log: Callable[[InputError], None] = warn_of_missing_scenes,
     ) -> Project:
         """The project that a folder lies in.
 

@@ -145,6 +145,11 @@ class RandomConfig(Section):
     shapes: tuple[Literal[tuple(SHAPES)], ...] = internal(
         tuple(SHAPES), "shapes, which consecutive scenes take in turn", min_length=1
     )
+    # No other table may contain scenes of a seed for development, and results/random.csv of it has no verdicts.
+    development_seeds: tuple[Seed, ...] = internal(
+        (1, 2, 3, 4), "seeds on whose scenes methods are developed"
+    )
+    reported_seeds: tuple[Seed, ...] = internal((7, 11), "seeds of recorded results, which are used up")
     size: PositiveRange = internal((0.24, 0.4), "longest side of the bounding box [m]")
     height: Range = internal((0.2, 0.7), "initial y of the centre of the bounding box [m]")
     center: Range = internal((0.35, 0.65), "x and z of that centre [m]")
@@ -163,6 +168,17 @@ class RandomConfig(Section):
         gt=0,
         le=0.8,
     )
+
+    @model_validator(mode="after")
+    def _has_seeds_of_one_kind(self) -> RandomConfig:
+        if both := sorted({*self.development_seeds} & {*self.reported_seeds}):
+            raise ValueError(f"development_seeds: {both[0]} is also one of reported_seeds")
+        return self
+
+    @property
+    def is_development(self) -> bool:
+        """Whether methods are developed on the scenes of the seed."""
+        return self.seed in self.development_seeds
 
     @property
     def prefix(self) -> str:

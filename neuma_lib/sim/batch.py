@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from itertools import chain
 
@@ -15,6 +16,7 @@ from neuma_lib.sim.rollout import check_inside, checked_frames, fly_and_simulate
 from neuma_lib.sim.state import State, Trajectory
 from neuma_lib.threads import in_threads
 
+_LOGGER = logging.getLogger(__name__)
 TOGETHER = {"cpu": 1, "cuda": 64}
 """Copies that share launches. A GPU needs that many to be fully used. A core is fastest with one, which stays in its
 cache."""
@@ -46,7 +48,7 @@ def rollout_batch(
         together: number of copies that share launches, by default `TOGETHER` of the device.
 
     Returns:
-        The trajectory of each law, or None where it diverged.
+        The trajectory of each law, or None where it diverged. The log (level INFO) states why.
 
     Raises:
         InputError: as `rollout`, or the numbers of laws, models, initial states or their particles do not match, or
@@ -111,6 +113,14 @@ def _side_by_side(
         path, errors = fly_and_simulate(
             model, tuple(regions), state, frames, None, total, skip_free_flight, copies, frictions=frictions
         )
-    except NonFiniteError:
+    except NonFiniteError as error:
+        if copies > 1 and error.step is None:  # from the code of a law, which does not state the copy
+            alone = ((laws[k : k + 1], starts[k : k + 1], frictions[k : k + 1]) for k in range(copies))
+            options = frames, total, skip_free_flight
+            return [_side_by_side(model, *own, *options, each)[0] for *own, each in alone]
+        _LOGGER.info("no copy of %d is finite: %s", copies, error)
         return [None] * copies
+    for copy, error in enumerate(errors):
+        if error:
+            _LOGGER.info("copy %d of %d is left out: %s", copy, copies, error)
     return [None if error else own for own, error in zip(path.split(copies), errors, strict=True)]

@@ -199,6 +199,18 @@ def test_corrected_draws_keep_correlations_of_constants():
     assert plateau < 0.6 * slope
 
 
+def test_errors_that_all_images_share_widen_corrected_draws():
+    """Images without any error leave `model_std` of every modulus."""
+    shear = torch.tensor([0.01], dtype=torch.float64)
+
+    def spread(model_std):
+        draws = corrected(1e-6 * np.eye(3), size=0.02, count=200, model_std=model_std)
+        return log_spread(draws, lambda law: sheared(law, shear))[0]
+
+    assert spread(0.0) < 0.02
+    assert spread(0.1) > 0.09  # the standard deviation of 200 samples has a relative error of 5 %
+
+
 def test_envelope_contains_all_replicates():
     low, high = envelope([(np.array([0.0, 2]), np.array([1.0, 3])), (np.array([1.0, 1]), np.array([2.0, 2]))])
     assert low.tolist() == [0, 1] and high.tolist() == [2, 3]

@@ -54,7 +54,7 @@ def test_error_of_the_true_law_on_other_particles_is_that_of_sampling():
         for law in (LAW, analytic_law(PRIOR, MODEL.dt))
     )
     # A coordinate of uniform points in the ball has the variance R^2 / 5, so the centres of mass of two random sets
-    # are sqrt(2 * 3 * R^2 / (5 N)) apart; the floor meets each with its own. Three standard deviations.
+    # are sqrt(2 * 3 * R^2 / (5 N)) shifted; the floor meets each with its own. Three standard deviations.
     limit = 3e3 * math.sqrt(6 / (5 * particles)) * RADIUS
     assert result["tracer_rmse_mm"] < limit < wrong["tracer_rmse_mm"] / 3
     assert max(result["tracer_rmse_mm_per_frame"][:2]) < 1e-9  # before contact no sampling matters
@@ -100,6 +100,31 @@ def test_a_known_shift_of_the_truth_is_the_error():
     ).metrics
     late = [1e3 * 5e-3 * MODEL.dt * step for step in IN_FLIGHT]
     assert slower["tracer_rmse_mm_per_frame"] == pytest.approx(late, abs=1e-9)
+
+
+def test_every_frame_and_the_floor_count():
+    """The truth deviates in the last frame only. The other set of points of the truth is that of the prediction, so
+    that the floor equals the distance, or is 5 mm from it in all frames, so that the excess is negative."""
+    axis = 0.03 * torch.arange(-2, 3, dtype=torch.float64)
+    lattice = torch.cartesian_prod(axis, axis, axis) + torch.tensor([0.5, HEIGHT, 0.5], dtype=torch.float64)
+    (path,) = true_tracers(ball(), IN_FLIGHT, lattice)
+    shift = torch.tensor([3e-3, 0.0, 4e-3], dtype=torch.float64)  # 5 mm
+    truth = path.clone()
+    truth[-1] += shift
+    common = MODEL, LawOnGrid(LAW), ball(seed=1).state(V0), IN_FLIGHT
+    result = evaluate(*common, truth, path, lattice).metrics
+    assert result["frames"] == IN_FLIGHT and len(result["chamfer_per_frame"]) == len(IN_FLIGHT)
+    assert result["tracer_rmse_mm_per_frame"] == pytest.approx([0, 0, 0, 5], abs=1e-9)
+    assert result["tracer_rmse_mm"] == pytest.approx(2.5) and result["tracer_rmse_last_mm"] == pytest.approx(
+        5
+    )
+    assert result["chamfer"] == result["chamfer_floor"] == pytest.approx(0.125)
+    assert result["chamfer_excess"] == 0
+    shifted = evaluate(*common, path, path + shift, lattice).metrics
+    assert shifted["chamfer"] == pytest.approx(0, abs=1e-12) and shifted["chamfer_floor"] == pytest.approx(
+        0.5
+    )
+    assert shifted["chamfer_excess"] == pytest.approx(-0.5)
 
 
 class FailsOnce(Elasticity):

@@ -103,6 +103,27 @@ def test_constants_and_family_of_the_truth_are_identified():
     assert identified.as_dict()["law"]["plasticity"] == {"name": "identity"}
 
 
+def test_held_out_frames_select_the_family():
+    """The first frames are of one family, and fit it better. The last frames are those that the fit of the other one
+    predicts, which is therefore selected. Fits to the first frames do not depend on the last ones."""
+    families = {"hencky": ELASTIC, "neo_hookean": law("neo_hookean")}
+    options = settings(families, covariance_from="elastic", pyramid=(8, 32), prune_factor=1e30)
+    truth = law("hencky", E=1.5e4, nu=0.35)
+    body, seen = video_of(truth, V0, FRAMES, torch.zeros_like)
+    first = identify(MODEL, known(body), body, seen, options)
+    assert first.best.family.name == "hencky"
+    values, fitted = first.fits["neo_hookean"].values, len(first.frames[0])
+    _, later = video_of(law("neo_hookean", **values), V0, FRAMES, torch.zeros_like)
+    images = torch.cat([seen.images[:fitted], later.images[fitted:]])
+    second = identify(MODEL, known(body), body, replace(seen, images=images), options)
+    assert second.best.family.name == "neo_hookean"
+    for name, fit in second.fits.items():
+        assert fit.values == first.fits[name].values and fit.loss == first.fits[name].loss
+        penalised = math.log(max(fit.held_out, 1e-12)) + options.penalty * len(fit.values)
+        assert fit.score == pytest.approx(penalised, rel=1e-12)
+    assert second.fits["hencky"].loss < second.fits["neo_hookean"].loss
+
+
 def test_the_last_fit_does_not_start_from_misleading_first_frames(monkeypatch):
     """All frames are fitted at all levels, also from guesses, if the last ones are predicted far worse, as those of a
     plastic body by an elastic one."""
@@ -261,8 +282,13 @@ def test_the_finer_grid_decides_between_families_of_similar_scores(monkeypatch):
     monkeypatch.setattr(
         FamilyRun, "begin", lambda run, *given, **options: run._fine or begin(run, *given, **options)
     )
-    coarse_only = identify(MODEL, known(body), body, seen, options, refined=[body])
+    messages = []
+    coarse_only = identify(MODEL, known(body), body, seen, options, refined=[body], log=messages.append)
     assert coarse_only.best.family.name == "hencky" and coarse_only.material is None
+    dropped = [text for text in messages if "no constants of the material" in text]
+    assert len(dropped) == 1 and dropped[0].startswith("hencky: ")
+    identify(MODEL, known(body), body, seen, options, log=messages.append)
+    assert len([text for text in messages if "no constants of the material" in text]) == 1, "not asked for"
 
 
 @pytest.mark.parametrize("refinement", [2, 3])
@@ -592,6 +618,19 @@ def test_combinations_are_those_of_the_covariance():
     assert second["log_std"] == pytest.approx(math.sqrt(2) * 0.5, rel=1e-2)
     (_, E, std), *_ = fit.quantities(options)
     assert E == 6e4 and std == pytest.approx(0.5, rel=1e-2)
+
+
+def test_errors_that_all_images_share_are_part_of_every_uncertainty():
+    """Images without any error leave `model_std`."""
+    family, start = Family("hencky", ELASTIC), known(ball())
+    fit = FamilyFit(family, {"E": 6e4, "nu": 0.3}, 1.0, covariance=np.zeros((2, 2)), motions=(start,))
+    options = settings({"hencky": ELASTIC}, model_std=0.07)
+    assert [std for *_, std in fit.quantities(options)] == pytest.approx(
+        [0.07] * len(fit.quantities(options))
+    )
+    assert [each["log_std"] for each in fit.combinations(options)] == pytest.approx([0.07, 0.07])
+    stds = [each["log_std"] for each in fit.as_dict(options)["quantities"].values()]
+    assert stds == pytest.approx([0.07] * len(stds))
 
 
 def test_images_are_averaged_over_squares():

@@ -163,6 +163,22 @@ def test_recovery_returns_to_the_best_state_as_a_whole(problem, zero_gradients):
     assert 0 < step(again) < step(after_best)
 
 
+def test_a_run_that_is_killed_after_a_recovery_resumes_with_its_lower_rates(problem):
+    """The step after the resume is of the uninterrupted run, bit by bit."""
+    body, loss = problem
+    factors = [1.0, 0.1, 100.0, 0.1, 0.1, 0.1]  # the third one diverges
+    settings = SETTINGS.model_copy(update={"iterations": 4, "checkpoint_every": 1})
+    whole, keep = MemoryCheckpoint(), MemoryCheckpoint(fail_after=3)
+    train((body, ScriptedLoss(loss, factors)), settings=settings, checkpoint=whole)
+    with pytest.raises(KeyboardInterrupt):
+        train((body, ScriptedLoss(loss, factors)), settings=settings, checkpoint=keep)
+    assert keep.states[-1]["lr_scale"] == 0.5 and keep.states[-1]["iteration"] == 2
+    train((body, ScriptedLoss(loss, factors[3:])), settings=settings, checkpoint=keep)
+    assert [state["lr_scale"] for state in keep.states] == [state["lr_scale"] for state in whole.states]
+    for name, value in whole.states[-1]["law"].items():
+        assert torch.equal(value, keep.states[-1]["law"][name]), name
+
+
 def test_training_ends_marked_after_too_many_recoveries(problem):
     messages = []
     wild = TrainingConfig(

@@ -81,6 +81,23 @@ def test_only_the_part_that_improves_is_corrected(too_stiff):
     assert choice.held_out_frames == ((80, 110),) and choice.as_dict()["held_out_frames"] == [[80, 110]]
 
 
+def test_held_out_frames_do_not_reach_the_trials(problem):
+    """Other targets in the held-out frames change the held-out losses of the trials, and no bit of the fitted ones."""
+    body, loss = problem
+    spec = {"elasticity": FLOWS["elasticity"]}
+    path = rollout(
+        MODEL, structured_law(spec, MODEL.dt).double(), body.state(V0), steps=FRAMES[-1], frames=FRAMES
+    )
+    targets = path.x + torch.tensor([0.01, 0.0, 0.0], dtype=torch.float64)
+    changed = targets.clone()
+    changed[[FRAMES.index(80), FRAMES.index(110)]] += 0.05
+    choices = [fit((body, ParticleLoss(FRAMES, x)), spec, log=lambda _: None)[1] for x in (targets, changed)]
+    assert all(choice.held_out_frames == ((80, 110),) for choice in choices)
+    for name, score in choices[0].trials.items():
+        other = choices[1].trials[name]
+        assert score.loss == other.loss and score.held_out_loss != other.held_out_loss
+
+
 def test_the_last_training_goes_on_from_the_law_that_was_scored(problem, too_stiff):
     """Its first loss is that of the trial, over all frames from the contact on."""
     trained, choice, *_ = too_stiff

@@ -35,6 +35,7 @@ from neuma_lib.io.particles import (
     save_particles,
 )
 from neuma_lib.io.photographs import load_static
+from neuma_lib.io.positions import read_positions
 from neuma_lib.io.splats import load_splat
 from neuma_lib.io.weights import read_torch, read_weights
 from neuma_lib.mechanics.analytic import analytic_law
@@ -142,6 +143,11 @@ def _hdf5(add) -> None:
         body(folder)
         return truth(folder)
 
+    def predicted(folder: Path) -> Path:
+        np.savez(folder / "positions.npz", x=rng.random((3, 9, 3)), frames=np.arange(3))
+        return folder / "positions.npz"
+
+    add("positions.npz", predicted, lambda path: read_positions([path]))
     add("truth.h5", truth, lambda path: read_arrays(path, required=("x", "F")))
     add("rollout.h5", truth, load_motion)
     add("binding.h5", body, read_body)

@@ -1,5 +1,7 @@
 """Captures as scenes, and their videos on the simulator's clock."""
 
+import shutil
+
 import numpy as np
 import pytest
 
@@ -15,6 +17,7 @@ from neuma_lib.errors import InputError
 from neuma_lib.project import cases, checks
 from neuma_lib.project.capture_scenes import captured_scenes
 from neuma_lib.project.loading import load, read_yaml
+from neuma_lib.project.project import Project
 from neuma_lib.project.settings import NO_TRUTH
 from tests.support.errors import refused
 
@@ -64,6 +67,20 @@ def test_takes_that_are_held_out_train_nothing(captures):
     assert scenes["mug_two"].videos == () and scenes["mug_one"].videos == ()
     settings(captures, "held_out: [one, two]\n")
     assert captured_scenes(captures) == {}  # its own rules report the error
+
+
+def test_a_capture_without_scenes_is_warned_of_by_default(captures, caplog):
+    """As `neuma view` and other commands do, which then lack its scenes."""
+    settings(captures, "held_out: [three]\n")
+    assert captured_scenes(captures) == {}
+    shutil.copytree("config", captures / "project/config")
+    shutil.copytree(captures / "mug", captures / "project/captures/mug")
+    (captures / "project/Snakefile").touch()
+    loaded_settings, _ = Project.find(captures / "project")
+    assert "BouncyBall" in loaded_settings.scenes and "mug" not in loaded_settings.scenes
+    messages = [record.getMessage() for record in caplog.records]
+    assert len(messages) == 2 and all("a capture has no scenes: " in text for text in messages)
+    assert all("capture.yaml: held_out: no take 'three'" in text for text in messages)
 
 
 @pytest.mark.parametrize(

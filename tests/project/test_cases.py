@@ -231,3 +231,16 @@ def test_every_method_states_its_files_without_torch(loaded):
         assert all(isinstance(path, str) for path in case.source().paths)
         assert bool(case.method.product) == bool(case.method.fit_inputs(case))
         assert type(case.method) is type(methods()[case.method.name])
+
+
+def test_no_fit_depends_on_the_true_law(changed):
+    """Options of all fits are the same if the true law is another one. The law of the prior is none of the scenes'."""
+    law = {"elasticity": {"name": "stvk", "E": 4.2e4, "nu": 0.123}, "plasticity": {"name": "identity"}}
+    scenes = ("BouncyBall", "ClayCat", "HoneyBottle")
+    before, after = changed(), changed(scenes={scene: {"law": law} for scene in scenes})
+    for scene in scenes:
+        for name in before.methods:
+            one, other = (cases.case(settings, scene, name) for settings in (before, after))
+            assert one.prior_law == other.prior_law != one.scene_law != other.scene_law == law
+            if one.method.product:
+                assert one.method.fit_options(one) == other.method.fit_options(other), name

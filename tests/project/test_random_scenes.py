@@ -252,7 +252,34 @@ def test_table_and_sentences_count_scenes():
     assert rows[2]["failures"] == "NeuMA: its training diverged" and not rows[0]["failures"]
     assert "medians 8.0 mm (NCLaw), 2.0 mm (NeuMA), 3.0 mm (True law); RMSE 0.50 times" in sentences[0]
     assert "Velocity in plane within 2 % on 2 of 3" in text
-    assert "Scenes for tuning. Those that are reported are of seed 7" in random_table(scenes, METHODS, 1)[1]
+
+
+def test_scenes_for_development_have_no_verdicts_and_are_in_no_table(changed, loaded):
+    scenes = [result("random1_00_ball_hencky", 8.0, 2.0)]
+    assert "**holds**" in random_table(scenes, METHODS, 7)[1]
+    text = random_table(scenes, METHODS, 1, is_development=True)[1]
+    assert "results are not reported" in text and "holds" not in text
+    for seed, development in ((7, False), (1, True)):
+        drawn = changed(random={"seed": seed})
+        assert drawn.random.is_development is development
+        table = {"mine": {"scenes": drawn.random_scenes[:2], "methods": ["nclaw", "neuma"]}}
+        if development:
+            with refused("tables.mine.scenes", problem="development"):
+                changed(random={"seed": seed}, tables=table)
+        else:
+            changed(random={"seed": seed}, tables=table)
+    with refused("random", problem="7 is also one of reported_seeds"):
+        changed(advanced={"random.development_seeds": [1, 7]})
+
+
+def test_recorded_results_are_of_no_seed_for_development(loaded):
+    """Every random scene in a recorded table is of a seed that the settings call reported."""
+    recorded = {}
+    for file in Path("docs/results").rglob("*.csv"):
+        for seed in re.findall(r"\brandom(\d+)_\d", file.read_text()):
+            recorded.setdefault(int(seed), file.name)
+    assert recorded and recorded.keys() <= {*loaded.random.reported_seeds}, recorded
+    assert not recorded.keys() & {*loaded.random.development_seeds}
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Several rollouts in the same launches: equality with single rollouts, divergence of one, laws without kernels."""
 
+import logging
 import math
 import threading
 from dataclasses import replace
@@ -116,15 +117,41 @@ def test_number_of_copies_changes_no_bit():
         assert_same(paths[2], paths[0])
 
 
-def test_divergence_does_not_affect_other_copies():
+def test_divergence_does_not_affect_other_copies(caplog):
+    caplog.set_level(logging.INFO)
     laws = [law("hencky"), analytic_law(UNSTABLE), law("von_mises")]
     with pytest.raises(NonFiniteError):
         rollout(MODEL, laws[1], falling(), **RUN)
     first, lost, last = rollout_batch(MODEL, laws, falling(), **RUN)
-    assert lost is None
+    assert lost is None and "copy 1 of 3 is left out: rollout: particle" in caplog.text
     for path, own in ((first, laws[0]), (last, laws[2])):
         assert_same(path, rollout_batch(MODEL, [own], falling(), **RUN)[0])
     assert rollout_batch(MODEL, [laws[1]] * 2, falling(), **RUN) == [None, None]
+
+
+class SlowHencky(Hencky):
+    """A law of a user, which torch evaluates."""
+
+
+class Refusing(SlowHencky):
+    """A law whose third evaluation raises an error, which states no copy."""
+
+    count = 0
+
+    def response(self, F, weights):
+        Refusing.count += 1
+        if Refusing.count % 3 == 0:
+            raise NonFiniteError("refusing", "a stress is not finite")
+        return super().response(F, weights)
+
+
+def test_a_law_that_raises_does_not_affect_other_copies(caplog):
+    caplog.set_level(logging.INFO)
+    laws = [law("hencky"), Law(Refusing(E=5e4, nu=0.3), law("von_mises").plasticity), law("von_mises")]
+    first, lost, last = rollout_batch(MODEL, laws, falling(), **RUN)
+    assert lost is None and "refusing: a stress is not finite" in caplog.text
+    for path, own in ((first, laws[0]), (last, laws[2])):
+        assert_same(path, rollout_batch(MODEL, [own], falling(), **RUN)[0])
 
 
 def test_leaving_the_grid_does_not_affect_other_copies():
@@ -151,10 +178,6 @@ def test_a_batch_in_free_flight_needs_no_grid():
     for path in rollout_batch(MODEL, [law("hencky"), law("fluid")], high, **RUN):
         assert_same(path, rollout(MODEL, law("hencky"), high, **RUN))
         assert torch.equal(path.F[-1], torch.eye(3, dtype=torch.float64).expand(300, 3, 3))
-
-
-class SlowHencky(Hencky):
-    """A law of a user, which torch evaluates."""
 
 
 def test_laws_without_kernels_share_the_transfers():

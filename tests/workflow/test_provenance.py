@@ -9,7 +9,7 @@ import pytest
 
 from neuma_lib.mechanics.catalogue import DEFINED_IN
 from neuma_lib.project import cases
-from tests.support.project import Plan
+from tests.support.project import SCENE, Plan, overlay
 from workflow.provenance import Sources, fingerprint, law_files
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -183,6 +183,23 @@ def test_edits_rerun_what_depends_on_them(jobs_with_code, file, runs, spared):
             rerun.add(job.rule)
             replaced |= set(job.outputs)
     assert runs <= rerun and not spared & rerun
+
+
+TRUE_NU = "'nu': 0.45"
+"""In the true law of the scene, and in no other setting of these jobs."""
+
+
+def test_only_jobs_that_make_or_measure_the_truth_are_given_the_true_law(clone):
+    """Parameters of Table 1, and of an identification, whose file is touched instead of computed."""
+    target = f"{SCENE}/identified.json"
+    (clone.root / target).write_text("{}")
+    clone.run("--touch", "--forcerun", "identify", *overlay(identify={"refined_particles": 0}), target)
+    given = {}
+    for record in (clone.root / ".snakemake/metadata").iterdir():
+        content = json.loads(record.read_text())
+        given.setdefault(content["rule"], []).append(TRUE_NU in str(content["params"]))
+    assert {rule for rule, has in given.items() if any(has)} == {"ground_truth"}
+    assert {"identify", "fit_neuma", "prior", "velocity", "evaluate"} <= given.keys()
 
 
 def test_a_method_in_a_file_counts_with_what_it_imports(tmp_path):

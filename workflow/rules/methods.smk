@@ -202,8 +202,7 @@ def prior_replicate(wildcards):
 @checked
 def published_law(wildcards):
     """The analytic law that a scene's prior is trained on. None if the prior is a file of the user."""
-    law = SETTINGS.priors.laws.get(SETTINGS.scene(wildcards.scene).prior)
-    return law.plain() if law else None
+    return cases.published_law(SETTINGS, SETTINGS.scene(wildcards.scene).prior)
 
 
 @checked

@@ -59,6 +59,7 @@ rule random_table:
         scenes=random_scenes(),
         titles={method: cases.title(SETTINGS, method) for method in SETTINGS.random.methods},
         seed=SETTINGS.random.seed,
+        development=SETTINGS.random.is_development,
     script:
         "../scripts/random_table.py"
 

@@ -17,7 +17,7 @@ def main(inputs, output, params, run) -> None:
         }
         for (name, known), start in zip(params.scenes.items(), inputs.starts, strict=True)
     ]
-    csv, markdown, sentences = random_table(scenes, params.titles, params.seed)
+    csv, markdown, sentences = random_table(scenes, params.titles, params.seed, params.development)
     write_text(output.csv, csv)
     write_text(output.markdown, markdown)
     for sentence in sentences:
