@@ -56,7 +56,7 @@ def flex_scene(
   <!--
 {comment}
   -->
-  <option timestep="{dt:.9g}" gravity="{_numbers(gravity)}" integrator="Euler" solver="CG" tolerance="1e-8"/>
+  <option timestep="{dt:.9g}" gravity="{_numbers(gravity)}" integrator="Euler"/>
   <size memory="200M"/>
   <worldbody>
     <geom name="floor" type="plane" size="0 0 1" zaxis="0 1 0" friction="{friction:.9g} 0 0" condim="3"/>

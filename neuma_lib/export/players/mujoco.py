@@ -16,13 +16,15 @@ steps = int(sys.argv[1]) if len(sys.argv) > 1 else scene["steps"]
 model = mujoco.MjModel.from_xml_path(str(here / "scene.xml"))
 data = mujoco.MjData(model)
 data.qvel[:] = body["v"].ravel()  # three slides for each vertex
-mujoco.mj_forward(model, data)
-t, x = [0.0], [data.flexvert_xpos.copy()]
+start = model.body_pos[1:]
+t, x = [0.0], [start]
 for step in range(1, steps + 1):
     mujoco.mj_step(model, data)
     if step % scene["every"] == 0 or step == steps:
         t.append(step * scene["dt"])
-        x.append(data.flexvert_xpos.copy())
+        x.append(start + data.qpos.reshape(-1, 3))
+if data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number:
+    sys.exit("MuJoCo became unstable. Reduce dt in scene.json and timestep in scene.xml")
 masses = model.body_mass[1:]
 np.savez(here / "motion.npz", t=t, x=np.stack(x).astype(np.float32), masses=masses)
 print(
