@@ -23,11 +23,11 @@ model = builder.finalize()
 config = SolverImplicitMPM.Config.create_from_usd(stage.GetPrimAtPath(imported["particle_scene_path"]))
 solver = SolverImplicitMPM(model, config)
 state = model.state()
-t, x = [0.0], [state.particle_q.numpy()]
+t, x = [0.0], [state.particle_q.numpy().copy()]
 for step in range(1, steps + 1):
     solver.step(state, state, None, None, scene["dt"])
     if step % scene["every"] == 0 or step == steps:
         t.append(step * scene["dt"])
-        x.append(state.particle_q.numpy())
+        x.append(state.particle_q.numpy().copy())
 np.savez(here / "motion.npz", t=t, x=np.stack(x).astype(np.float32))
 print(f"{steps} steps, mean position {x[-1].mean(axis=0).round(4).tolist()} m: {here / 'motion.npz'}")
