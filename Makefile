@@ -5,6 +5,7 @@
 # make coverage the fast unit tests with the coverage of neuma_lib and of its public functions
 # make capture  the environment, with OpenCV, COLMAP and MeshLab for own photographs and videos (docs/capture.md)
 # make viewer   the environment, with viser for the viewer in a browser (docs/viewer.md)
+# make engines  the environment, with newton, MuJoCo and scikit-fem (docs/engines.md)
 # make docs-env the environment, with mkdocs for the site
 # make test-core  build the package, install it without extras in a fresh environment, run the tests marked `core` there
 # make lock     write envs/ from pyproject.toml and envs/pins.txt
@@ -18,7 +19,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 READY := $(VENV)/.ready
 SNAKEMAKE := $(BIN)/snakemake --cores $(CORES)
 
-.PHONY: table1 demo all dataset test test-all test-core coverage lint env capture viewer docs-env check unlock lock clean
+.PHONY: table1 demo all dataset test test-all test-core coverage lint env capture viewer engines docs-env check unlock lock clean
 
 table1: env unlock
 	$(SNAKEMAKE) results/table1.csv
@@ -71,6 +72,9 @@ capture: env envs/requirements-capture.txt
 
 viewer: env envs/requirements-viewer.txt
 	$(INSTALL) -r envs/requirements-viewer.txt
+
+engines: env envs/requirements-engines.txt
+	$(INSTALL) -r envs/requirements-engines.txt
 
 docs-env: env envs/requirements-docs.txt
 	$(INSTALL) -r envs/requirements-docs.txt

@@ -5,6 +5,7 @@ requirements-dev.txt      the same with the tools for tests and style checks
 requirements-capture.txt  requirements.txt with the packages for captures
 requirements-viewer.txt   requirements.txt with the packages for the viewer's server
 requirements-docs.txt     requirements.txt with the packages for the site
+requirements-engines.txt  requirements.txt with other engines and finite elements
 conda.yaml, conda-capture.yaml  the same packages in a conda environment with Python 3.11, untested
 
 A version that is already in one of these files is kept while it satisfies the pins; `make lock UPGRADE=--upgrade`
@@ -29,6 +30,7 @@ EXTRAS = {
     "requirements-capture.txt": (*RUN, "capture"),
     "requirements-viewer.txt": (*RUN, "viewer"),
     "requirements-docs.txt": (*RUN, "docs"),
+    "requirements-engines.txt": (*RUN, "engines"),
 }
 CONDA = {"conda.yaml": "requirements.txt", "conda-capture.yaml": "requirements-capture.txt"}
 OPTIONS = (

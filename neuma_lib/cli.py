@@ -113,6 +113,27 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument(
         "--dt", type=float, help="if SOURCE is a file: time step that it was learned with [s]"
     )
+    engine = "write a material of this engine instead: .json, newton and usd also .usda, mujoco also .xml"
+    export.add_argument("--engine", metavar="NAME", help=f"{engine} (genesis, newton, mujoco, usd)")
+    _add_material_options(export)
+    export.add_argument("--density", type=float, help="density [kg/m^3] (default: that of its scene)")
+    export.add_argument(
+        "--substep", type=float, help="time step of the engine [s] (default: that of the law)"
+    )
+    world = "convert a law of a scaled simulator to metres of the filmed world"
+    export.add_argument("--world", action="store_true", help=world)
+    importer = _command(
+        law,
+        _import,
+        "import: read the material of another engine as a law",
+        "Reads a Genesis class with arguments (.json), a newton material (.usda) or a MuJoCo flex (.xml). "
+        "Example: neuma law import gel.xml gel.safetensors",
+    )
+    importer.add_argument("source", metavar="SOURCE", help="file with the material, .json, .usda or .xml")
+    importer.add_argument("target", metavar="TARGET", help="file to write, .safetensors")
+    importer.add_argument(
+        "--substep", type=float, help="time step of the engine [s], for a viscous Genesis liquid"
+    )
     show = _command(
         law,
         _show,
@@ -172,6 +193,20 @@ def _parser() -> argparse.ArgumentParser:
     device = "where the live mode simulates (default: a GPU if there is one)"
     view.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help=device)
 
+    scene = _group(commands, "scene", "export a scene to another engine")
+    scene_export = _command(
+        scene,
+        _scene_export,
+        "export: write body, law, start and floor as a scene of Genesis, newton or MuJoCo",
+        "Writes a folder with the scene and run.py, which plays it in the engine without this library. "
+        "Example: neuma scene export results/BouncyBall/constants ball_in_newton --engine newton",
+    )
+    scene_export.add_argument("source", metavar="SOURCE", help="folder of a method in results/")
+    scene_export.add_argument("target", metavar="TARGET", help="folder to write")
+    scene_export.add_argument("--engine", required=True, metavar="NAME", help="genesis, newton or mujoco")
+    _add_material_options(scene_export)
+    scene_export.add_argument("--configfile", nargs="+", default=[], metavar="FILE", help=CONFIGFILE)
+
     timings = _command(
         commands,
         _timings,
@@ -181,6 +216,12 @@ def _parser() -> argparse.ArgumentParser:
     results = "folder of results (default %(default)s)"
     timings.add_argument("folder", nargs="?", default="results", metavar="FOLDER", help=results)
     return parser
+
+
+def _add_material_options(parser: argparse.ArgumentParser) -> None:
+    fit = "fit the nearest law that the engine has, over the states that the law has visited"
+    parser.add_argument("--fit", action="store_true", help=fit)
+    parser.add_argument("--force", action="store_true", help="accept a fit with a large stress error")
 
 
 def _command(commands: Any, run: Any, summary: str, description: str) -> argparse.ArgumentParser:
@@ -279,6 +320,11 @@ def _export(options: argparse.Namespace) -> None:
 
     source = Path(options.source)
     law, known = _of_method(options) if source.is_dir() else _of_file(options)
+    if options.engine is not None:
+        _export_to_engine(options, law, known)
+        return
+    if options.fit or options.density is not None:
+        raise InputError("--engine", "is missing", "Name the engine, or leave out --fit and --density")
     if options.weight != 1.0:
         if options.separate_adaptor:
             raise InputError("--weight", "a separate adaptor has no fixed weight", "Leave out --separate")
@@ -291,6 +337,84 @@ def _export(options: argparse.Namespace) -> None:
     )
     step = "" if about["dt"] is None else f", learned at dt = {about['dt']:g} s"
     print(f"{options.target}: {about['kind']}{step}" + (f"; {options.page}" if options.page else ""))
+
+
+def _export_to_engine(options: argparse.Namespace, law: Law, known: dict[str, Any]) -> None:
+    from neuma_lib.export.laws import USD, law_for_engine, write_engine_law
+    from neuma_lib.export.materials import ENGINES, check_engine
+
+    check_engine(options.engine, (*ENGINES, USD))
+    engine = "newton" if options.engine == USD else options.engine
+    if options.engine == USD and Path(options.target).suffix != ".usda":
+        raise InputError(options.target, "the suffix is not .usda", "Give the file that suffix")
+    if options.weight != 1.0 or options.page or options.separate_adaptor:
+        raise InputError("--engine", "has no --weight, --page or --separate", "Leave them out")
+    names = ("density", "substep", "fit", "force", "world")
+    states = _visited_states(known)
+    material, about = law_for_engine(
+        law, known, engine, states=states, **{name: getattr(options, name) for name in names}
+    )
+    write_engine_law(options.target, engine, material, about)
+    _print_material(options.target, material, about)
+
+
+def _print_material(target: str, material: Any, about: dict[str, Any]) -> None:
+    arguments = ", ".join(
+        f"{key} = {value if isinstance(value, (str, bool)) else format(value, '.4g')}"
+        for key, value in material.arguments.items()
+    )
+    print(f"{target}: {material.kind}, {arguments}")
+    for name, error in (about["fit"] or {}).items():
+        print(f"stress error of the fit over the visited states ({name}): {100 * error:.1f} %")
+    for note in material.notes:
+        print(f"note: {note}")
+
+
+def _visited_states(known: dict[str, Any], count: int = 4000) -> Any:
+    """Elastic states (N, 3, 3) of the motion of a method's folder, None without one."""
+    if "rollout" not in known:
+        return None
+    import torch
+
+    from neuma_lib.evaluation.stress import deformed_frames
+    from neuma_lib.io.hdf5 import read_arrays
+
+    F = torch.from_numpy(read_arrays(known["rollout"], required=("F",), only=("F",))[0]["F"])
+    F = F[deformed_frames(F)].reshape(-1, 3, 3)
+    return F[:: max(1, len(F) // count)] if len(F) else None
+
+
+def _import(options: argparse.Namespace) -> None:
+    from neuma_lib.export.laws import import_law
+
+    spec = import_law(options.source, options.target, substep=options.substep)
+    print(f"{options.target}: {json.dumps(spec)}")
+
+
+def _scene_export(options: argparse.Namespace) -> None:
+    from neuma_lib.api import Scene
+    from neuma_lib.export.laws import law_for_engine
+    from neuma_lib.export.scenes import EngineScene, export_scene
+
+    if not Path(options.source).is_dir():
+        raise InputError(
+            options.source, "is not a folder", "Give that of a method, for example results/Ball/neuma"
+        )
+    for name in ("adaptor", "dt", "any_time_step"):
+        setattr(options, name, None)
+    law, known = _of_method(options)
+    scene = Scene.load(Path(options.source).absolute().parent)
+    frames = scene.video.frames if scene.video else scene.truth.frames if scene.truth else (0, 400)
+    every = min(b - a for a, b in zip(frames[:-1], frames[1:], strict=True))
+    own = EngineScene.of(scene.mpm, scene.state(), frames[-1], every, scene.reconstruction.gaussians)
+    known["scale"] = None  # the whole scene keeps the scale of the simulator
+    material, about = law_for_engine(
+        law, known, options.engine, density=own.density, substep=own.dt, fit=options.fit, force=options.force,
+        states=_visited_states(known),
+    )  # fmt: skip
+    notes = export_scene(options.target, options.engine, own, about["law"], about)
+    _print_material(options.target, material._replace(notes=tuple(notes)), about)
+    print(f"Play it with: python {options.target}/run.py")
 
 
 def _of_method(options: argparse.Namespace) -> tuple[Law, dict[str, Any]]:
@@ -318,6 +442,7 @@ def _of_method(options: argparse.Namespace) -> tuple[Law, dict[str, Any]]:
         origin["grid"] = None
     files = {"metrics": place / "metrics.json", "rollout": place / "rollout.h5"}
     of_this = {name: file for name, file in files.items() if file.is_file() and origin["scene"] == scene}
+    origin["constants"] = model.constants
     return law, {**origin, **of_this, "any_time_step": options.any_time_step, "commit": head_commit(root)}
 
 
@@ -339,7 +464,7 @@ def _of_file(options: argparse.Namespace) -> tuple[Law, dict[str, Any]]:
     law = load_law(source, options.adaptor, dt, options.any_time_step, alpha)
     of_the_law = ("grid", "gravity", "density", "scale")
     if not options.adaptor:
-        of_the_law += ("scene", "method", "prior", "weight", "commit", "metrics", "visited")
+        of_the_law += ("scene", "method", "prior", "weight", "commit", "metrics", "visited", "constants")
     kept = {key: stated[key] for key in of_the_law if key in stated}
     kept |= {"prior": source.name} if options.adaptor else {}
     any_time_step = options.any_time_step or stated.get("any_step") is True

@@ -11,6 +11,7 @@
 | ``scene``, ``method``, ``prior``, ``weight`` | scene, method and prior of the training; weight w of the correction |
 | ``commit`` | of the code that wrote the file |
 | ``metrics`` | numbers of its metrics.json |
+| ``constants`` | ``value`` and ``log_std``, the standard deviation of the logarithm, of the constants of an identified law |
 | ``visited`` | ranges of the states visited in the training scene (`neuma_lib.evaluation.material_point`); the law is untrained outside them |
 
 Unknown values are null.
@@ -55,7 +56,7 @@ def about_law(law: Law, dt: float | None, any_time_step: bool = False, **known: 
         if isinstance(value, float) and not math.isfinite(value):
             raise InputError(key, f"{value} must be a finite number")
     conditions = ("grid", "gravity", "density", "scale")
-    origin = ("scene", "method", "prior", "commit", "metrics", "visited")
+    origin = ("scene", "method", "prior", "commit", "metrics", "visited", "constants")
     kind = "networks" if isinstance(law, AdaptableLaw) else "analytic"
     return {
         **dict.fromkeys((*conditions, *origin)),

@@ -227,6 +227,28 @@ class Law(nn.Module):
         known = {"dt": None, **about}
         _imported("io.laws").save_law(path, self, _imported("io.exported").about_law(self, **known))
 
+    def kirchhoff(self, F: Tensor) -> Tensor:
+        """Kirchhoff stress tau [Pa] of trial deformation gradients after the return map, both (N, 3, 3).
+
+        Differentiable in F and the weights, in the precision of F, as a module of other solvers.
+        """
+        elastic, plastic = (tuple(w.to(F) for w in own) for own in self.weights())
+        return self.elasticity.response(self.plasticity.response(F, plastic), elastic)
+
+    def first_piola(self, F: Tensor) -> Tensor:
+        """First Piola-Kirchhoff stress P = tau F^-T [Pa], (N, 3, 3), of `kirchhoff`."""
+        return torch.linalg.solve(F, self.kirchhoff(F).mT).mT
+
+    def tangent(self, F: Tensor) -> Tensor:
+        """Consistent tangent dP_ij / dF_kl [Pa], (N, 3, 3, 3, 3), of `first_piola`. Detached."""
+        with torch.enable_grad():
+            F = F.detach().requires_grad_()
+            components = self.first_piola(F).sum(dim=0).flatten()
+            if not components.requires_grad:
+                return F.new_zeros(len(F), 3, 3, 3, 3)
+            rows = [torch.autograd.grad(component, F, retain_graph=True)[0] for component in components]
+        return torch.stack(rows, dim=1).unflatten(1, (3, 3))
+
     def weights(self) -> tuple[Weights, Weights]:
         """Weights of the elasticity and of the plasticity."""
         return self.elasticity.weights(), self.plasticity.weights()

@@ -34,7 +34,11 @@ class Constants(Method):
         if "material" in identified:
             law.grid = identified.get("grid")
             material = analytic_law(identified["material"]["law"], dt=dt)
-        return LawOnGrid(law, exported=material, friction=recorded_friction(identified), **options)
+        known = identified.get("material") or identified.get("best") or {}
+        friction = recorded_friction(identified)
+        return LawOnGrid(
+            law, exported=material, friction=friction, constants=known.get("constants"), **options
+        )
 
     def uncertainty_inputs(self, case: Case) -> Files:
         return self.model_inputs(case)

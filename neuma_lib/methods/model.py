@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from torch import Tensor
 
@@ -20,10 +20,12 @@ class MotionModel(ABC):
         law: the material law that the motion follows from, None if there is none.
         exported: that law for other simulators, which holds on any grid if it is another object.
         stable: whether the fit ended without divergence.
+        constants: ``value`` and ``log_std`` of the constants of the exported law by name, None if they are unknown.
     """
 
     law: Law | None = None
     stable: bool = True
+    constants: Mapping[str, Mapping[str, float]] | None = None
 
     @property
     def exported(self) -> Law | None:
@@ -63,6 +65,7 @@ class LawOnGrid(MotionModel):
         friction: Coulomb coefficient of the body and its obstacles. None: those of the simulation, as for several
             bodies together.
         elsewhere: whether obstacles with a finite coefficient keep it.
+        constants: of the exported law, see `MotionModel`.
     """
 
     def __init__(
@@ -73,8 +76,9 @@ class LawOnGrid(MotionModel):
         exported: Law | None = None,
         friction: float | None = None,
         elsewhere: bool = False,
+        constants: Mapping[str, Mapping[str, float]] | None = None,
     ):
-        self.law = laws[0]
+        self.law, self.constants = laws[0], constants
         self.stable, self.friction, self.elsewhere = stable, friction, elsewhere
         self._exported = exported
         self._laws, self._counts = laws, counts

@@ -40,7 +40,7 @@ def test_every_package_of_the_project_has_one_exact_pin():
     assert len(PINS) == len(wanted)
 
 
-@pytest.mark.parametrize("extra", ["dev", "capture", "viewer", "docs"])
+@pytest.mark.parametrize("extra", ["dev", "capture", "viewer", "docs", "engines"])
 def test_locked_files_follow_the_pins(extra):
     locked = requirements(f"requirements-{extra}.txt")
     extras = PROJECT["optional-dependencies"]

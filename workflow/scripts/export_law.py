@@ -8,7 +8,7 @@ from workflow.stage import run_script
 def main(inputs, output, params, run) -> None:
     model = Prediction(inputs, params.method).model(params.origin["dt"])
     measured = {name: inputs.get(name) or None for name in ("metrics", "rollout")}
-    known = {**params.origin, "commit": head_commit("."), **measured}
+    known = {**params.origin, "commit": head_commit("."), "constants": model.constants, **measured}
     if model.exported is not model.law:
         known["grid"] = None
     about = export_law(output.law, model.exported, page=output.page, **known)

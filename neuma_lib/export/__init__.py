@@ -1,0 +1,1 @@
+"""Laws and scenes for other engines: Genesis, newton, MuJoCo, and USD files."""
