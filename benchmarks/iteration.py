@@ -83,12 +83,14 @@ def simulation_parts(scene: BenchmarkScene, device: torch.device) -> list[Part]:
     elastic, plastic = flat[:3], flat[3:]
     plan = MemoryPlan(segment=2, caches_steps=True, law_cache_bytes=math.inf)
     sim = Simulation(scene.model, bodies, slices, scene.body.state(scene.v0), steps=2, plan=plan)
-    sim.run((path.x[0], path.v[0], path.F[0], path.C[0], path.stuck[0]), flat, (2,))
     ws = sim.workspace
+    at_rest = (torch.zeros_like(states[0]) for states in ws.states[4:])  # tangential displacements in contact
+    sim.run((path.x[0], path.v[0], path.F[0], path.C[0], *at_rest), flat, (2,))
     F, F_trial, tau = ws.F[0], ws.F_trial[0], ws.tau[0]
     for grad in (ws.grad_x, ws.grad_v, ws.grad_C, ws.grad_F):
         grad.normal_()
-    ws.grad_grid.zero_()
+    if not ws.native:
+        ws.grad_grid.zero_()
     grads = [torch.zeros_like(w) for w in flat]
 
     def on_stream(work: Callable[..., object], *args) -> Callable[[], None]:
