@@ -229,7 +229,7 @@ class EmulatedStructuredLaws:
         backward = f"{common}, {array} grad_out_, {array} grad_F_, {array} partials_"
         add = f"{array} partials_, int summands, {totals}"
         # a GPU caches nothing
-        uncached = "    const int cached = 0;\n    const uint64_t cache = 0;\n"
+        uncached = "    const int cached = 0, adds = 0;\n    const uint64_t cache = 0;\n"
         bodies = []
         for name in structured_kernels.KINDS:
             for which, parameters in (("evaluate", forward), ("vjp", backward)):
