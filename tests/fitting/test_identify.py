@@ -450,7 +450,8 @@ def test_a_plateau_widens_what_is_not_determined(flat):
         return 1.0 + u @ run.fit.curvature @ u / (flat if u[1] > 0 else 1.0)
 
     run._simulate, run._cost = lambda points: points, cost
-    np.testing.assert_allclose(run.inflated_covariance(), np.diag([1e-4, min(0.25 * flat, 4.0)]), atol=1e-9)
+    added = run.covariance_of_plateaus()
+    np.testing.assert_allclose(added, np.diag([0.0, min(0.25 * flat, 4.0) - 0.25]), atol=1e-9)
     assert len(tried) == 2 and all(abs(u[1]) == pytest.approx(1.0) for u in tried)
 
 
