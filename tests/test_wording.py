@@ -76,7 +76,7 @@ NAMES = {
     "forget": (_CALLED, "clear_cache"),
     "reconsider": (_CALLED, "restart_from"),
     "disagree": (_CALLED, "widen_by_ties"),
-    "widened": (_CALLED, "inflated_covariance"),
+    "widened": (_CALLED, "covariance_of_plateaus"),
     "try trial choice": (_CLASS, "Candidate, Score, Selection"),
     "least": (r"(?<!\w)_?(?:least|LEAST)_(?!squares)\w+", "MIN_*, min_*"),
     "most": (r"(?<!\w)_?(?:most|MOST)_\w+", "MAX_*, max_*"),

@@ -125,7 +125,7 @@ class FamilyRun:
         self.alive = costs[best] < below
         if self.alive:
             self._origin, self._images = origins[best], {self._u.tobytes(): residuals[best]}
-            similar = [run for run in like if run.family.constants == self.family.constants]
+            similar = [run for run in like if run.alive and run.family.constants == self.family.constants]
             if similar:
                 self._columns, self._exact = {self._u.tobytes(): similar[0].columns}, False
             self.refine(level, **how)
@@ -142,7 +142,7 @@ class FamilyRun:
 
         Args:
             rough: end early, with derivatives that have been updated, as always before the last level.
-            limit: cost beyond which the fit is given up.
+            limit: cost beyond which the fit ends.
         """
         self._level, last = level, level == len(self.settings.pyramid) - 1
         self._u, self.fit, steps = levenberg_marquardt(
@@ -200,8 +200,8 @@ class FamilyRun:
         by_prior = np.linalg.pinv(self.fit.curvature + P) @ P * self._spreads
         return jackknife(self.fit, P) + by_prior @ by_prior.T
 
-    def inflated_covariance(self) -> np.ndarray:
-        """Covariance (k, k) of the constants, inflated along axes where the images change less than linearly predicted.
+    def covariance_of_plateaus(self) -> np.ndarray:
+        """Covariance (k, k) to add along axes where the images change less than linearly predicted.
 
         The cost is evaluated at two standard deviations along the undetermined principal axes, on the side where it
         increases less. The variance is multiplied by the ratio of the predicted to the actual increase, up to
@@ -209,6 +209,7 @@ class FamilyRun:
         """
         k, whole = self._constants, self._covariance()
         variances, axes = np.linalg.eigh(whole[:k, :k])
+        added = np.zeros((k, k))
         for variance, axis in zip(variances, axes.T, strict=True):
             if not self.settings.determined**2 < variance < self.settings.spread**2:
                 continue
@@ -218,8 +219,8 @@ class FamilyRun:
             costs = [math.inf if residual is None else self._cost(residual) for residual in residuals]
             predicted, actual = step @ self.fit.curvature @ step, max(min(costs) - self.fit.cost, MIN_COST)
             inflated = min(variance * max(predicted / actual, 1.0), self.settings.spread**2)
-            whole[:k, :k] += (inflated - variance) * np.outer(axis, axis)
-        return whole[:k, :k]
+            added += (inflated - variance) * np.outer(axis, axis)
+        return added
 
     def lowest_friction(self) -> float | None:
         """The smallest Coulomb coefficient that the images admit if they also admit sticking, else None, also if it is

@@ -4,7 +4,12 @@ Fits the constants of every candidate family and selects the family with the low
 Levenberg-Marquardt through rollout and renderer, with a Jacobian of a few rollouts. It proceeds from coarse to fine
 levels of an image pyramid, because the basin of convergence of sharp images is about a pixel. Constants are unbounded
 logarithms or logits. A family is initialised from the best of its default guess, the scene's prior and the fits of
-simpler families. Families whose loss exceeds ``prune_factor`` times the best with the same return map are dropped.
+simpler families. A family with the constants of another, or with a limit that flows, follows that one at the level
+before the last. Families whose loss exceeds ``prune_factor`` times the best with the same return map are dropped.
+
+Rollouts on the finer grid take most of the time, then those of differences. Derivatives are therefore passed on to the
+next level, family or grid, and updated by the steps (`secant_update`). They are differentiated again after a step that
+fails, and for the final fits. Steps that predict less than the noise of the images by unsteady contacts are not tried.
 
 The initial motion is estimated from the frames before contact, with an uncertainty that would bias the constants. The
 last level therefore also fits velocity and spin with a prior, and a constant shift and enlargement of the rendered
@@ -33,6 +38,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
+
+import numpy as np
 
 from neuma_lib.config.identify import FRICTION_NEEDS, IdentifyConfig
 from neuma_lib.coupling.initial_motion import InitialMotion
@@ -109,7 +116,7 @@ def identify(
     rounds = len(settings.pyramid)
     late = []
     for family in families:
-        if any(_is_near(family, run.family) for run in running):
+        if rounds > 1 and any(_is_near(family, run.family) for run in running):
             late.append(family)
         else:
             running.append(_first_fit(family, videos, running, published_values, settings))
@@ -136,7 +143,7 @@ def identify(
     if refined:
         fine = _on_finer_grid(running, fits, videos, settings)
     if any(each.alive for each in fine.values()):
-        compared = {name: each.score() for name, each in fine.items()}
+        compared = {name: each.score() for name, each in fine.items() if each.alive}
         _log_fits(compared.values(), " on the finer grid", log)
     selected, ties = _select(list(compared.values()), settings)
     name = selected.family.name
@@ -158,16 +165,18 @@ def identify(
         sticking, start = Family(run.family.name, run.family.spec), (final.values, final.deviations)
         final = FamilyRun(sticking, videos, counts, settings)
         final.begin(start[:1], rounds - 1, start[1])
+    # Plateaus are properties of the material that both grids show.
+    plateaus = final.covariance_of_plateaus() if final.alive else np.zeros(())
     material = None
     if name in fine and fine[name].alive and final.alive:
         whole = FamilyRun(final.family, videos, counts, settings, fine=True)
         starts = [{key: each[key] for key in final.values} for each in (fine[name].values, final.values)]
         whole.begin(starts[: 2 if first == 0 else 1], rounds - 1, final.deviations, like=[final])
         if whole.alive:
-            material = _final_fit(whole, selected, [compared[tie] for tie in ties])
+            material = _final_fit(whole, plateaus, selected, [compared[tie] for tie in ties])
     if refined and material is None:
         log(f"{name}: no constants of the material, because no simulation on the finer grid is finite")
-    best = _final_fit(final, fits[name], [fits[tie] for tie in ties])
+    best = _final_fit(final, plateaus, fits[name], [fits[tie] for tie in ties])
     best.lowest_friction = lowest
     if material is not None:
         material = material.extrapolated(best, settings.refinement)
@@ -197,7 +206,9 @@ def _on_finer_grid(
     the best family with each return map whose held-out loss is at most the square of it.
 
     Images of the finer grid may differ by more than a pixel, hence the fit at the coarsest level first, unless a near
-    family has been fitted there. Derivatives are those of the coarse grid until a step fails.
+    family has been fitted there. Derivatives are those of the coarse grid until a step fails. Those with
+    ``prune_factor`` times the lowest loss are not alive, nor those that do not lower the loss of a family that they
+    contain by ``penalty`` for each additional constant.
     """
     ranked = sorted((run for run in running if run.alive), key=lambda run: fits[run.family.name].score)
     lowest, factor = fits[ranked[0].family.name].score if ranked else 0.0, math.log(settings.prune_factor)
@@ -222,6 +233,14 @@ def _on_finer_grid(
                 limit = settings.prune_factor * min((each.fit.cost for each in done), default=math.inf)
                 again.refine(last, rough=True, limit=limit)
         fine[run.family.name] = again
+    done = [run for run in fine.values() if run.alive]
+    for run in done:
+        inner = [each for each in done if run.family.contains(each.family)]
+        limits = [settings.prune_factor * min(each.fit.cost for each in done)]
+        for each in inner:
+            more = len(run.family.constants) - len(each.family.constants)
+            limits.append(each.fit.cost * math.exp(-settings.penalty * more))
+        run.alive = run.fit.cost <= min(limits)
     return fine
 
 
@@ -234,11 +253,13 @@ def _log_fits(fits: Iterable[FamilyFit], where: str, log: Callable[[str], None])
         )
 
 
-def _final_fit(run: FamilyRun, selected: FamilyFit, ties: Sequence[FamilyFit]) -> FamilyFit:
-    """The fit of a run to all frames, with an uncertainty that includes plateaus, parts of the video, and ties."""
+def _final_fit(
+    run: FamilyRun, plateaus: np.ndarray, selected: FamilyFit, ties: Sequence[FamilyFit]
+) -> FamilyFit:
+    """The fit of a run to all frames, with an uncertainty that includes ``plateaus``, parts of the video, and ties."""
     fit = run.score()
     if fit.covariance is not None:
-        fit.covariance = run.inflated_covariance()
+        fit.covariance = fit.covariance + plateaus
         fit.widen_by_ties(selected, ties)
     return fit
 

@@ -70,6 +70,15 @@ class Residuals(Protocol):
         may be updated from that at a former point."""
 
 
+def in_blocks(values: Tensor) -> Tensor:
+    """Values (T, V, H, W, C) grouped by block of the image, shape (V * blocks, values)."""
+    T, V, H, W, C = values.shape
+    tall, wide = -(-H // BLOCKS), -(-W // BLOCKS)
+    full = torch.nn.functional.pad(values, (0, 0, 0, wide * BLOCKS - W, 0, tall * BLOCKS - H))
+    split = full.reshape(T, V, BLOCKS, tall, BLOCKS, wide, C)
+    return split.permute(1, 2, 4, 0, 3, 5, 6).reshape(V * BLOCKS**2, T * tall * wide * C)
+
+
 def block_sums(columns: Sequence[Tensor], residual: Tensor) -> tuple[np.ndarray, np.ndarray]:
     """J^T J and J^T r of every block of the image, summed over frames, shapes (V * blocks, k, k) and (V * blocks, k).
 

@@ -82,7 +82,10 @@ def test_the_coefficient_of_a_sliding_body_is_identified(given, tmp_path):
     assert abs(math.log(value / 0.3)) < min(2 * from_images, 4 * smallest) and smallest < from_images < 0.1
     assert std == pytest.approx(math.hypot(from_images, SETTINGS.model_std))
     assert result.best.values["E"] == pytest.approx(6e4, rel=0.02)
-    assert content["best"]["quantities"][FRICTION]["determined"] and f"{FRICTION} = {value:.4g}" in content["says"]
+    assert (
+        content["best"]["quantities"][FRICTION]["determined"]
+        and f"{FRICTION} = {value:.4g}" in content["says"]
+    )
     assert all(set(axis["powers"]) == {"G", "K", FRICTION} for axis in content["best"]["combinations"])
     assert FRICTION not in str(content["law"]) + str(content["best"]["unbounded"])
     write_json(tmp_path / "identified.json", content)  # refuses what is no number

@@ -23,6 +23,7 @@ from neuma_lib.fitting.least_squares import (
     BLOCKS,
     Linearisation,
     block_sums,
+    in_blocks,
     jackknife,
     levenberg_marquardt,
     secant_update,
@@ -476,7 +477,8 @@ def test_a_plateau_widens_what_is_not_determined(flat):
         return 1.0 + u @ run.fit.curvature @ u / (flat if u[1] > 0 else 1.0)
 
     run._simulate, run._cost = lambda points: points, cost
-    np.testing.assert_allclose(run.inflated_covariance(), np.diag([1e-4, min(0.25 * flat, 4.0)]), atol=1e-9)
+    added = run.covariance_of_plateaus()
+    np.testing.assert_allclose(added, np.diag([0.0, min(0.25 * flat, 4.0) - 0.25]), atol=1e-9)
     assert len(tried) == 2 and all(abs(u[1]) == pytest.approx(1.0) for u in tried)
 
 
@@ -780,14 +782,11 @@ def test_sums_of_blocks_are_those_of_all_pixels():
         column[:, :, :4] = 0.0
     curvatures, scores = block_sums(columns, r)
     assert curvatures.shape == (3 * BLOCKS**2, k, k) and scores.shape == (3 * BLOCKS**2, k)
-    expected = np.zeros_like(curvatures), np.zeros_like(scores)
-    J = torch.stack(columns, dim=-1).double().numpy()
-    for (t, v, y, x), _ in np.ndenumerate(np.zeros(shape[:-1])):
-        block = v * BLOCKS**2 + BLOCKS * (y // 3) + x // 4
-        expected[0][block] += J[t, v, y, x].T @ J[t, v, y, x]
-        expected[1][block] += J[t, v, y, x].T @ r[t, v, y, x].double().numpy()
-    np.testing.assert_allclose(curvatures, expected[0], rtol=1e-10, atol=1e-12)
-    np.testing.assert_allclose(scores, expected[1], rtol=1e-10, atol=1e-12)
+    J = torch.stack([in_blocks(column) for column in columns], dim=-1).double()
+    np.testing.assert_allclose(curvatures, J.mT @ J, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(
+        scores, (J.mT @ in_blocks(r).double()[..., None])[..., 0], rtol=1e-10, atol=1e-12
+    )
 
 
 def test_least_squares_of_a_line_and_its_jackknife():
