@@ -90,7 +90,8 @@ def _parser() -> argparse.ArgumentParser:
         _export,
         "export: write a learned law to one file",
         "Writes a learned law to one .safetensors file, with its time step, origin and the range of deformations that "
-        "it was learned from. Example: neuma law export results/RubberPawn/neuma law.safetensors --page law.png",
+        "it was learned from, and a model card, .md, next to it. Example: neuma law export results/RubberPawn/neuma "
+        "law.safetensors --page law.png",
     )
     export.add_argument("source", metavar="SOURCE", help="folder of a method, or file of a law")
     export.add_argument("target", metavar="TARGET", help="file to write, .safetensors")
@@ -490,11 +491,17 @@ def _dataset(options: argparse.Namespace) -> None:
     for name in (scenes := options.scenes or [*settings.tables["table1"].scenes, *settings.random_scenes]):
         if name not in names:
             raise InputError(name, f"no scene with a true motion has this name{hint(name, names)}")
+    data, needed = Path(settings.data_root), ("truth.h5", "static/transforms.json", "dynamic/transforms.json")
+    files = [str(data / name / file) for name in scenes for file in needed]
+    missing = [file for file in files if not (root / file).is_file()]
+    if missing:
+        problem = f"{len(missing)} files of the scenes do not exist"
+        raise InputError(missing[0], problem, f"Run `snakemake --cores 2 {' '.join(missing)}`")
     for name in scenes:
         scene = settings.scene(name).plain()
         known = {"dt": scene["dt"], "density": scene["density"]}
         about = {**known, **settings.scene_world(name), **settings.obstacles(name)}
-        write_scene(options.layout, root / settings.data_root / name, options.out, name, about)
+        write_scene(options.layout, root / data / name, options.out, name, about)
     print(f"{options.out}: {len(scenes)} scenes. Keep {options.out}/truth from the methods that are scored.")
 
 

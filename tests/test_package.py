@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import yaml
 
 import neuma_lib
 from neuma_lib.extras import require
@@ -127,3 +128,13 @@ def test_the_archives_hold_every_file_that_the_library_reads(tmp_path):
     assert any(file.endswith(".cu") for file in files) and "neuma_lib/viewer/page.html" in files
     assert files <= in_wheel and files <= in_sdist
     assert not [name for name in in_wheel if name.startswith(("workflow", "tests", "benchmarks"))]
+
+
+def test_the_citation_is_of_this_version():
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert citation["version"] == neuma_lib.__version__ and citation["license"] == "MIT"
+    assert (
+        citation["cff-version"] == "1.2.0" and {"title", "authors", "message", "abstract"} <= citation.keys()
+    )
+    paper = citation["preferred-citation"]
+    assert paper["title"].startswith("NeuMA") and len(paper["authors"]) == 6

@@ -1,4 +1,4 @@
-"""Export a law and its metadata to one file, and read them."""
+"""Export a law and its metadata to one file, with a model card next to it, and read them."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from typing import Any
 import torch
 
 from neuma_lib.errors import InputError
+from neuma_lib.evaluation.law_card import law_card
 from neuma_lib.evaluation.material_point import Visited, largest_shear_stress
 from neuma_lib.evaluation.stress import deformed_frames
 from neuma_lib.extras import require
 from neuma_lib.io.exported import about_law, read_about
-from neuma_lib.io.files import read_json
+from neuma_lib.io.files import read_json, write_text
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.laws import load_law, save_law
 from neuma_lib.mechanics.law import Law
@@ -32,10 +33,10 @@ def export_law(
     page: str | Path | None = None,
     **known: Any,
 ) -> dict[str, Any]:
-    """Write a law and its metadata.
+    """Write a law, its metadata, and its model card (`neuma_lib.evaluation.law_card`).
 
     Args:
-        path: ``.safetensors``.
+        path: ``.safetensors``. The card has the same name with ``.md``.
         dt: time step that it was learned at [s].
         separate_adaptor, any_time_step: see `save_law` and `about_law`.
         metrics, rollout: metrics.json and rollout.h5 of its method, or None.
@@ -58,6 +59,7 @@ def export_law(
     about = about_law(law, dt, any_time_step, **known)
     write_page = _drawn(law, about, page) if page else None
     save_law(path, law, about, separate_adaptor)
+    write_text(Path(path).with_suffix(".md"), law_card(about))
     if write_page is not None:
         write_page()
     return about

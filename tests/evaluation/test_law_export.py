@@ -12,6 +12,7 @@ import torch
 from safetensors.torch import save_file
 
 from neuma_lib.cli import main
+from neuma_lib.evaluation.law_card import law_card
 from neuma_lib.evaluation.law_export import export_law
 from neuma_lib.io.exported import EXPORT, about_law, read_about
 from neuma_lib.io.files import write_json
@@ -387,6 +388,28 @@ def test_a_folder_of_results_is_exported(project, capsys):
     seen, sigma = about["visited"], torch.linalg.svdvals(deformations(50, 0.05).double())
     assert seen["stretch"] == pytest.approx([float(sigma[:, 2].min()), float(sigma[:, 0].max())])
     assert seen["shear_stress"] > 0
+    card = target.with_suffix(".md").read_text()
+    for text in ("ClayCat / neuma", "plasticine, 1.0", "24 cells", "| tracer RMSE [mm] | 3.5 |", f"{DT:g}"):
+        assert text in card, text
+    assert f"{seen['stretch'][0]:.4g}, {seen['stretch'][1]:.4g}" in card and "absorbed discretisation" in card
+    assert "Other time steps" in card and "None" not in card
+
+
+def test_a_card_states_what_is_known_and_what_the_law_is_not_for(tmp_path):
+    """Unknown values have no row. Constants of the material hold on any grid and at any time step."""
+    about = about_law(analytic_law({"elasticity": HENCKY}), None)
+    card = law_card(about)
+    assert "scene" not in card and "| grid |" not in card and "time step [s]" not in card
+    assert "seen is unknown" in card and "another density" in card.lower()
+    assert "Other grids" not in card and "Other time steps" not in card
+    networks_about = about | {"step": "fixed", "dt": 1e-3, "grid": 24, "metrics": {"diverged_at_step": 7}}
+    card = law_card(networks_about)
+    assert "Other grids" in card and "Other time steps" in card and "at which it diverged" in card
+    assert "Other time steps" not in law_card(networks_about | {"any_step": True})
+    odd = law_card(about | {"scene": "a|b\nc", "visited": "x", "metrics": 3, "dt": "y"})
+    assert "a/b c" in odd and all(
+        line.startswith(("|", "#", "-", "`", "It")) for line in odd.splitlines() if line
+    )
 
 
 def test_constants_are_exported_with_their_step(project):

@@ -127,7 +127,7 @@ def test_frames_that_cannot_be_counted_and_folders_that_exist_are_refused(data, 
     write_scene("neuma", uneven, tmp_path / "out", "Ball", {})
     with refused("out/Ball", remedy="--out"):
         write_scene("neuma", uneven, tmp_path / "out", "Ball", {})
-    with refused("nothing/static/transforms.json", remedy="snakemake --cores 2"):
+    with refused("nothing/truth.h5", problem="does not exist"):
         write_scene("neuma", tmp_path / "nothing", tmp_path / "other", "Ball", {})
 
 
@@ -141,7 +141,9 @@ def test_the_command_writes_and_scores(data, tmp_path, monkeypatch, capsys):
     assert known["gravity"] == [0.0, -9.8, 0.0]
     assert main(["dataset", "--layout", "neuma", "--out", "more", "BouncyBal"]) == 1
     assert main(["dataset", "--layout", "neuma", "--out", "more"]) == 1  # the others are not rendered
-    assert "did you mean BouncyBall" in (errors := capsys.readouterr().err) and "snakemake" in errors
+    assert "did you mean BouncyBall" in (errors := capsys.readouterr().err)
+    scene = "data/random7_11_cat_neo_hookean"
+    assert "51 files of the scenes do not exist" in errors and f"{scene}/truth.h5 {scene}/static/" in errors
     shutil.copytree(ROOT / "docs/results", "docs/results", ignore=shutil.ignore_patterns("figures", "gpu"))
     np.savez("mine.npz", x=motion(0) + np.float32([3e-3, 0, 4e-3]) * (np.array(STEPS) > 0)[:, None, None])
     assert main(["score", "mine.npz", "--truth", "out/truth/BouncyBall.h5"]) == 0

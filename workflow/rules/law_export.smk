@@ -9,6 +9,7 @@ rule export_law:
         rollout=own_result("rollout.h5"),
     output:
         law=f"{RESULTS}/{{scene}}/{{method}}/export/law.safetensors",
+        card=f"{RESULTS}/{{scene}}/{{method}}/export/law.md",
         page=f"{RESULTS}/{{scene}}/{{method}}/export/law.png",
     params:
         origin=checked(lambda wildcards: cases.law_origin(SETTINGS, wildcards.scene, wildcards.method)),

@@ -27,7 +27,7 @@ from PIL import Image
 
 from neuma_lib.errors import InputError
 from neuma_lib.io.datasets.layouts import BACKGROUND
-from neuma_lib.io.files import atomic, existing, write_json, write_text
+from neuma_lib.io.files import atomic, write_json, write_text
 from neuma_lib.io.hdf5 import read_arrays, write_arrays
 from neuma_lib.io.images import image_file, read_image_set, read_transforms, write_transforms
 from neuma_lib.io.positions import write_points
@@ -87,9 +87,8 @@ def write_scene(
     source, folder = Path(source), Path(out, name)
     if folder.exists():
         raise InputError(folder, "exists already", "Choose another --out, or delete it")
-    render = f"Run `snakemake --cores 2 {source}/truth.h5 {source}/{{static,dynamic}}/transforms.json` before"
-    static, dynamic = (existing(source / part / "transforms.json", render) for part in PARTS)
-    motion, attributes = read_arrays(existing(source / "truth.h5", render), required=MOTION, only=MOTION)
+    static, dynamic = (source / part / "transforms.json" for part in PARTS)
+    motion, attributes = read_arrays(source / "truth.h5", required=MOTION, only=MOTION)
     photographs, video = _pictures(static), _pictures(dynamic)
     LAYOUTS[layout](folder, video, photographs, motion["time"])
     write_points(folder / "starts.ply", motion["tracers"][0])
