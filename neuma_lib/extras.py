@@ -7,7 +7,13 @@ from types import ModuleType
 
 from neuma_lib.errors import InputError
 
-TARGETS = {"workflow": "env", "blender": "env", "capture": "capture", "viewer": "viewer", "engines": "engines"}
+TARGETS = {
+    "workflow": "env",
+    "blender": "env",
+    "capture": "capture",
+    "viewer": "viewer",
+    "engines": "engines",
+}
 """Target of the Makefile that installs the pinned versions of an extra."""
 
 

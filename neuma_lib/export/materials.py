@@ -99,18 +99,6 @@ def engine_material(
         ) from None
 
 
-def engines_of(spec: Mapping[str, Any], density: float, substep: float) -> list[str]:
-    """The engines that have an analytic law."""
-    able = []
-    for engine in ENGINES:
-        try:
-            engine_material(spec, density, substep, engine)
-        except InputError:
-            continue
-        able.append(engine)
-    return able
-
-
 def check_engine(engine: str, known: tuple[str, ...] = ENGINES) -> None:
     """Raise an `InputError` for an engine that is not known."""
     if engine not in known:

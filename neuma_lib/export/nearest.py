@@ -20,6 +20,8 @@ from neuma_lib.mechanics.law import Law
 
 MAX_ERROR = 0.1
 """Largest relative stress error of a fit that is accepted without force."""
+MAX_STATES = 1000
+"""Approximate number of the visited states that are compared."""
 INCREMENT = 0.1
 """Strain of a trial state, relative to the visited strains."""
 _STARTS: dict[str, dict[str, Sequence[float]]] = {
@@ -68,6 +70,7 @@ def nearest(law: Law, states: Tensor, engine: str, dt: float) -> Fit:
     """
     check_engine(engine)
     F = states.double().reshape(-1, 3, 3)
+    F = F[:: max(1, len(F) // MAX_STATES)]
     tau = stress(law, F)
     if not bool(tau.isfinite().all()) or not bool(tau.abs().max() > 0):
         raise InputError(
@@ -76,7 +79,11 @@ def nearest(law: Law, states: Tensor, engine: str, dt: float) -> Fit:
     trial = trial_states(F)
     after = stress(law, returned(law, trial))
     fits = [_fit(names, F, tau, trial, after, dt) for names in RULES[engine]]
-    return min((fit for fit in fits if fit is not None), key=lambda fit: fit.error)
+    able = [fit for fit in fits if fit is not None]
+    enough = min(fit.error for fit in able) + 0.01  # a simpler law is preferred to 1 % of the stress
+    return min(
+        (fit for fit in able if fit.error <= enough), key=lambda fit: (len(fit.spec["plasticity"]), fit.error)
+    )
 
 
 def trial_states(F: Tensor, seed: int = 0) -> Tensor:

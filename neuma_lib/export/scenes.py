@@ -30,8 +30,8 @@ from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.splatting.spherical_harmonics import sh0_to_rgb
 
 CONTACT = "Contact is no part of a law. It is that of the engine, so that rebounds differ"
-MAX_UNEVEN = 1e-3
-"""Largest relative difference of particle volumes that count as equal."""
+MAX_UNEVEN, MAX_SPREAD = 1e-3, 0.2
+"""Largest relative difference of densities that count as one, and standard deviation of volumes over their mean."""
 SAMPLE_EDGE, SAMPLE_COUNT, SAMPLE_HEIGHT = 0.2, 16, 0.1
 """Edge [m], particles along it, and height above the floor [m] of the cube in the file of a law alone."""
 
@@ -158,14 +158,18 @@ def export_scene(
         the notes.
 
     Raises:
-        InputError: the engine has no such material, or the body has no uniform density, or for Genesis no equal
-            volumes of its particles.
+        InputError: the engine has no such material, or the body has no uniform density, or its particles
+            too different volumes.
     """
     check_engine(engine)
     material = engine_material(spec, scene.density, scene.dt, engine)
-    if engine == "genesis" and np.ptp(scene.vol0) > MAX_UNEVEN * scene.vol0.mean():
-        raise InputError("particles", "Genesis needs particles of equal volume", "Use another engine")
     folder, notes = Path(folder), (*material.notes, *scene.notes)
+    spread = float(scene.vol0.std() / scene.vol0.mean())
+    if spread > MAX_SPREAD:
+        problem = f"volumes with a standard deviation of {100 * spread:.0f} % of the mean are not supported"
+        raise InputError("particles", problem, f"Use particles with less than {100 * MAX_SPREAD:.0f} %")
+    if engine == "genesis" and spread > 1e-3:
+        notes += (f"all particles get the mean volume, from which theirs differ by {100 * spread:.0f} %",)
     content = _about(engine, material._replace(notes=notes), {**about, "law": spec, "density": scene.density})
     times = {name: getattr(scene, name) for name in ("dt", "steps", "every", "grid", "gravity")}
     # JSON has no infinity
@@ -192,12 +196,13 @@ def _about(engine: str, material: EngineMaterial, about: Mapping[str, Any]) -> d
         "of the material" if grid is None else f"fitted on a grid of {grid} cells, whose error they contain"
     )
     notes = [*material.notes, f"constants {constants}", CONTACT]
-    keys = ("law", "constants", "density", "scale", "grid", "substep", "fit", "scene", "method", "commit")
+    keys = ("law", "constants", "density", "scale", "substep", "fit", "scene", "method", "commit")
     return {
         "engine": engine,
         "class": material.kind,
         "arguments": material.arguments,
         "notes": notes,
+        "grid_of_law": grid,
         **{key: about.get(key) for key in keys},
     }
 
@@ -205,9 +210,9 @@ def _about(engine: str, material: EngineMaterial, about: Mapping[str, Any]) -> d
 def _text(engine: str, scene: EngineScene, material: EngineMaterial, about: Mapping[str, Any]) -> str:
     shared = dict(gravity=scene.gravity, friction=scene.friction)
     if engine == "newton":
-        width = float(scene.vol0.mean()) ** (1 / 3)
+        widths = scene.vol0 ** (1 / 3)
         return particle_scene(
-            scene.x, scene.v, scene.mass, width, scene.colors, material.arguments,
+            scene.x, scene.v, scene.mass, widths, scene.colors, material.arguments,
             density=scene.density, cell=1 / scene.grid, about=about, **shared,
         )  # fmt: skip
     vertices, tetrahedra, masses, _, cell = _mesh(scene)

@@ -90,7 +90,9 @@ def read_elasticity(path: str | Path) -> dict[str, Any]:
     (flex,) = flexes
     if flex.get("dim", "2") != "3":
         raise InputError(path, "its flex is no solid", 'Only flexes with dim="3" can be read')
-    elasticity = flex.find("elasticity")
+    edge, elasticity = flex.find("edge"), flex.find("elasticity")
+    if edge is not None and edge.keys():
+        raise InputError(path, f"its edges have {', '.join(edge.keys())}, which is no part of a solid's law")
     values = {} if elasticity is None else dict(elasticity.items())
     try:
         numbers = {key: float(value) for key, value in values.items()}

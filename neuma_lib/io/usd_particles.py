@@ -39,7 +39,7 @@ def particle_scene(
     x: np.ndarray,
     v: np.ndarray,
     masses: np.ndarray,
-    width: float,
+    widths: np.ndarray,
     colors: np.ndarray | None,
     material: Mapping[str, float],
     *,
@@ -54,7 +54,7 @@ def particle_scene(
     Args:
         x, v: positions [m] and velocities [m/s], (N, 3).
         masses: of the particles [kg], (N,).
-        width: edge of the cube of a particle [m], whose volume newton takes as width^3.
+        widths: edges of the cubes of the particles [m], (N,), whose volumes newton takes as widths^3.
         colors: linear colours in [0, 1], (N, 3), or None.
         material: newton's attributes by name, without ``mpm:`` (`ATTRIBUTES`). ``damping`` is in seconds.
         density: of the material [kg/m^3].
@@ -67,7 +67,7 @@ def particle_scene(
     down = [float(g) / strength for g in gravity] if strength else [0.0, -1.0, 0.0]
     values = {**material, "damping": material.get("damping", 0.0) * material.get("young_modulus", 0.0)}
     attributes = "\n".join(f"        float newton:mpm:{ATTRIBUTES[k]} = {v:.9g}" for k, v in values.items())
-    ends = f"[{_vector(x.min(axis=0) - width / 2)}, {_vector(x.max(axis=0) + width / 2)}]"
+    ends = f"[{_vector(x.min(axis=0) - widths.max() / 2)}, {_vector(x.max(axis=0) + widths.max() / 2)}]"
     display = "" if colors is None else (
         f'\n        color3f[] primvars:displayColor = {_vectors(colors)} (interpolation = "vertex")'
     )  # fmt: skip
@@ -127,8 +127,8 @@ def Xform "scene"
         float3[] extent = {ends}
         point3f[] points = {_vectors(x)}
         vector3f[] velocities = {_vectors(v)}
-        float[] widths = [{width:.9g}] (interpolation = "constant")
-        float[] physics:masses = [{", ".join(f"{m:.9g}" for m in masses)}]{display}
+        float[] widths = {_list(widths)} (interpolation = "vertex")
+        float[] physics:masses = {_list(masses)}{display}
         rel material:binding:physics = </scene/law>
         rel physics:simulationOwner = </scene/physics>
     }}
@@ -178,7 +178,11 @@ def read_material(path: str | Path) -> tuple[dict[str, float], float | None]:
 
 
 def _vector(values: Sequence[float] | np.ndarray) -> str:
-    return f"({', '.join(f'{float(value):.9g}' for value in values)})"
+    return f"({_list(values)[1:-1]})"
+
+
+def _list(values: Sequence[float] | np.ndarray) -> str:
+    return f"[{', '.join(f'{float(value):.9g}' for value in values)}]"
 
 
 def _vectors(rows: np.ndarray) -> str:

@@ -21,6 +21,7 @@ from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.sim.colliders import Collider
 from tests.export.test_materials import RHO, spec_of
 from tests.support.errors import refused
+from tests.support.viewer_project import make_project
 
 DT = 5e-4
 CELL, SPACING, SIDE = 0.025, 0.0125, 12
@@ -241,9 +242,44 @@ def test_a_scene_with_what_an_engine_does_not_get_is_refused(tmp_path):
     uneven = np.where(np.arange(len(own.x)) % 2, 1.0, 1.2)
     with refused("density", problem="not uniform"):
         export_scene(tmp_path, "newton", replace(own, mass=own.mass * uneven), spec_of("hencky"), {})
-    with refused("particles", problem="equal volume"):
-        scene = replace(own, mass=own.mass * uneven, vol0=own.vol0 * uneven)
+    with refused("particles", problem="standard deviation"):
+        scene = replace(own, mass=own.mass * uneven**4, vol0=own.vol0 * uneven**4)
         export_scene(tmp_path, "genesis", scene, spec_of("neo_hookean"), {})
     with refused("law stvk + identity", remedy="mujoco can"):
         export_scene(tmp_path, "newton", own, spec_of("stvk"), {})
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.core
+def test_a_filmed_scene_is_exported_with_the_constants_of_the_material(tmp_path, capsys):
+    folder = make_project(tmp_path)
+    identified = json.loads((folder / "identified.json").read_text())
+    material = {"elasticity": {"name": "hencky", "E": 4e4, "nu": 0.3}}
+    constants = {"E": {"value": 4e4, "log_std": 0.07}}
+    identified |= {"grid": 24, "material": {"law": material, "constants": constants}}
+    (folder / "identified.json").write_text(json.dumps(identified))
+    out = tmp_path / "out"
+    assert main(["scene", "export", str(folder / "constants"), str(out), "--engine", "newton"]) == 0
+    assert f"Play it with: python {out}/run.py" in capsys.readouterr().out
+    content = json.loads((out / "scene.json").read_text())
+    assert content["arguments"]["young_modulus"] == 4e4 and content["constants"] == constants
+    assert content["grid"] == 24 and content["grid_of_law"] is None
+    assert content["scene"] == "BouncyBall" and content["steps"] == 30
+    assert "constants of the material" in content["notes"]
+    assert "primvars:displayColor" in (out / "scene.usda").read_text()
+    assert main(["law", "export", str(folder / "constants"), str(out / "l.json"), "--engine", "newton"]) == 0
+    assert json.loads((out / "l.json").read_text())["arguments"]["young_modulus"] == 4e4
+    for source, engine, words in (
+        (folder / "constants", "genesis", "newton can"),
+        (folder / "nclaw", "newton", "no networks"),
+        (folder / "constants", "unity", "must be one of"),
+        (folder, "newton", "its motion follows from no material law"),
+    ):
+        capsys.readouterr()
+        status = main(["scene", "export", str(source), str(tmp_path / "no"), "--engine", engine])
+        error = capsys.readouterr().err
+        assert status == 1 and error.count("\n") == 1, (source, error)
+        assert words in error or source == folder, error
+    assert main(["scene", "export", str(folder / "nclaw"), str(tmp_path / "fit"), "--engine", "newton", "--fit",
+                 "--force"]) == 0  # fmt: skip
+    assert "stress error of the fit" in capsys.readouterr().out
