@@ -207,8 +207,8 @@ def _on_finer_grid(
 
     Images of the finer grid may differ by more than a pixel, hence the fit at the coarsest level first, unless a near
     family has been fitted there. Derivatives are those of the coarse grid until a step fails. Those with
-    ``prune_factor`` times the lowest loss are not alive, nor those that do not lower the loss of a family that they
-    contain by ``penalty`` for each additional constant.
+    ``prune_factor`` times the lowest loss are not alive, nor those that do not lower the loss of a family with fewer
+    constants by ``penalty`` for each additional one.
     """
     ranked = sorted((run for run in running if run.alive), key=lambda run: fits[run.family.name].score)
     lowest, factor = fits[ranked[0].family.name].score if ranked else 0.0, math.log(settings.prune_factor)
@@ -235,12 +235,11 @@ def _on_finer_grid(
         fine[run.family.name] = again
     done = [run for run in fine.values() if run.alive]
     for run in done:
-        inner = [each for each in done if run.family.contains(each.family)]
-        limits = [settings.prune_factor * min(each.fit.cost for each in done)]
-        for each in inner:
-            more = len(run.family.constants) - len(each.family.constants)
-            limits.append(each.fit.cost * math.exp(-settings.penalty * more))
-        run.alive = run.fit.cost <= min(limits)
+        more = {each: len(run.family.constants) - len(each.family.constants) for each in done}
+        simpler = [each.fit.cost * math.exp(-settings.penalty * n) for each, n in more.items() if n > 0]
+        run.alive = run.fit.cost <= min(
+            [settings.prune_factor * min(each.fit.cost for each in done), *simpler]
+        )
     return fine
 
 
