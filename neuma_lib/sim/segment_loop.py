@@ -31,17 +31,26 @@ def segment_loop(
     ws: Workspace, parts: Parts, caches_steps: bool, cache_bytes: float, tracers: Repeated | None = None
 ) -> SegmentLoop:
     """A `SegmentLoop` for these arguments, that of the last rollout in the workspace if it has the same ones."""
-    kernels = [
-        (kernel, here.start, here.stop, *(_number(value) for value in given.values()), *map(_number, weights))
+    given = [
+        (
+            kernel,
+            law.identity,
+            law.keeps_singular_values,
+            here.start,
+            here.stop,
+            *arguments.values(),
+            *weights,
+        )
         for regions in parts.values()
         for law, here, weights in regions
-        for kernel, given in [law.kernel(ws.F[0][here], weights, False)]
+        for kernel, arguments in [law.kernel(ws.F[0][here], weights, False)]
     ]
-    key = kernels, caches_steps, cache_bytes, PARTICLE_STEPS
+    key = [tuple(map(_number, each)) for each in given], caches_steps, cache_bytes, PARTICLE_STEPS
     if tracers is not None:
         return SegmentLoop(ws, parts, caches_steps, cache_bytes, tracers)
     if ws.loop is None or ws.loop[0] != key:
-        ws.loop = key, SegmentLoop(weakref.proxy(ws), parts, caches_steps, cache_bytes)
+        loop = SegmentLoop(weakref.proxy(ws), parts, caches_steps, cache_bytes)
+        ws.loop = key, loop, given  # kept, so that no other tensors have their addresses
     loop = ws.loop[1]
     loop.clear_sums()
     return loop
@@ -349,8 +358,8 @@ def _launch(kernel: wp.Kernel) -> wp.Launch:
     return wp.launch(kernel, dim=1, inputs=inputs, device="cpu", block_dim=1, record_cmd=True)
 
 
-def _number(value: Tensor | float) -> float:
-    """An argument of a kernel: a number, or the address of a tensor."""
+def _number(value: Any) -> Any:
+    """An argument of a kernel, if it is a tensor its address."""
     return value.data_ptr() if isinstance(value, Tensor) else value
 
 

@@ -104,7 +104,7 @@ class Workspace:
         self.size = size
         self._views: dict[int, wp.array] = {}
         self.law_caches: dict[tuple, Any] = {}
-        self.loop: tuple[Any, Any] | None = None
+        self.loop: tuple[Any, Any, Any] | None = None
         self.graphs = GraphCache()
         self.weights: list[Tensor] = []
         self.grad_weights: list[Tensor] = []
