@@ -15,8 +15,12 @@ _TOTAL_FLOATS = 9  # F_total of a particle
 _CONTACT_FLOATS = 3  # tangential displacement of a particle in contact
 _STEP_FLOATS = 18  # tau, F_trial of a particle
 _NODE_FLOATS = 8  # grid, grid_v of a node
-_NEXT_FLOATS = 9  # tau after the last step of a particle, in the same case
-_REUSED_NODE_FLOATS = 12  # grid, grid_v and grad_grid of a node, if steps share them
+
+# if steps share their grids, and only the nodes that particles touch are kept:
+_NEXT_FLOATS = 9  # tau after the last step of a particle
+_REUSED_NODE_FLOATS = 12  # grid, grid_v and grad_grid of a node
+_KEPT_FLOATS = 4  # momentum and mass of a touched node, at most one for each particle
+_KEPT_ROW_BYTES = 8  # bounds of the touched nodes of a row
 
 
 @dataclass(frozen=True)
@@ -45,7 +49,7 @@ def plan_memory(
     memory: float | None = None,
     total: bool = False,
     contact: bool = False,
-    keeps_grids: bool = True,
+    rows: int = 0,
 ) -> MemoryPlan:
     """The fastest plan that fits into memory.
 
@@ -56,14 +60,18 @@ def plan_memory(
         memory: maximum bytes for states and intermediate values together; None does not limit the states.
         total: whether states include the total deformation.
         contact: whether states include the tangential displacement of contact of particles.
-        keeps_grids: whether the grids of a step belong to its intermediate values. If not, all steps share them.
+        rows: number of rows of nodes of all copies if the steps share their grids, 0 if each has its own.
 
     Raises:
         InputError: segments of a single step do not fit into `memory`.
     """
     state = itemsize * (_STATE_FLOATS + total * _TOTAL_FLOATS + contact * _CONTACT_FLOATS) * particles
-    step = itemsize * (_STEP_FLOATS * particles + keeps_grids * _NODE_FLOATS * nodes)
-    shared = 0 if keeps_grids else itemsize * (_REUSED_NODE_FLOATS * nodes + _NEXT_FLOATS * particles)
+    step, shared = itemsize * _STEP_FLOATS * particles, 0
+    if rows:
+        step += itemsize * _KEPT_FLOATS * particles + _KEPT_ROW_BYTES * rows
+        shared = itemsize * (_REUSED_NODE_FLOATS * nodes + _NEXT_FLOATS * particles)
+    else:
+        step += itemsize * _NODE_FLOATS * nodes
     whole = state * (steps + 1) + step + shared
     if memory is None or whole <= memory:
         if memory is not None:

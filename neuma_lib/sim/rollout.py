@@ -187,9 +187,8 @@ def fly_and_simulate(
     if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
         cache_bytes = DEFAULT_CACHE_BYTES[x.device.type] if cache_bytes is None else cache_bytes
         nodes, contact = copies * model.nodes**3, model.contact == "particles"
-        plan = plan_memory(
-            steps, len(x), nodes, x.element_size(), cache_bytes, memory, total, contact, scatter != "native"
-        )
+        rows = nodes // model.nodes if scatter == "native" else 0
+        plan = plan_memory(steps, len(x), nodes, x.element_size(), cache_bytes, memory, total, contact, rows)
     simulation = Simulation(
         model, regions, slices, state, steps, first, plan, scatter, total, copies, frictions
     )
