@@ -36,7 +36,8 @@ def play(folder, *words):
         "OMP_NUM_THREADS": "1"
     }
     done = subprocess.run(
-        [sys.executable, str(folder / "run.py"), *words], env=environment, capture_output=True, text=True, timeout=900
+        [sys.executable, str(folder / "run.py"), *words], env=environment, cwd=folder, capture_output=True, text=True,
+        timeout=900,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-2000:]
     with np.load(folder / "motion.npz") as motion:
@@ -172,8 +173,9 @@ def test_blender_reads_the_coloured_particles(tmp_path):
 
 
 @pytest.mark.parametrize("stretch", [0.7, 0.8, 0.9, 1.05, 1.2])
-def test_end_force_of_mujoco_is_that_of_our_law(tmp_path, stretch):
+def test_end_force_of_mujoco_is_that_of_our_law(tmp_path, monkeypatch, stretch):
     mujoco = pytest.importorskip("mujoco")
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its log there
     spec = spec_of("stvk")
     export_scene(tmp_path, "mujoco", EngineScene.falling_cube(RHO, DT), spec, {})
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "scene.xml"))
