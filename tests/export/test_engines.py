@@ -223,7 +223,10 @@ def test_genesis_moves_a_cube_in_flight_as_this_library(tmp_path, names):
     export_scene(tmp_path, "genesis", scene, spec, {})
     _, x = play(tmp_path)
     difference = np.linalg.norm(x[-1] - our_motion(scene, spec)[-1], axis=1)
-    assert np.sqrt(np.mean(difference**2)) < (5e-4 if names[1] == "viscous_flow" else 1e-5)
+    limit = {"viscous_flow": 5e-4, "drucker_prager": 5e-5}.get(
+        names[1], 1e-5
+    )  # sand: volume correction of Genesis
+    assert np.sqrt(np.mean(difference**2)) < limit
 
 
 # Examples
