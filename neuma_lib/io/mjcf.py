@@ -41,7 +41,8 @@ def flex_scene(
         radius: distance from a vertex at which contact starts [m].
         dt: time step [s].
         gravity: [m/s^2].
-        friction: Coulomb coefficient of the floor, which may be infinite.
+        friction: Coulomb coefficient of the floor, which may be infinite. With pyramidal cones, bodies fall through a
+            floor of a coefficient above 2.
         about: texts of a comment by name.
     """
     friction = min(friction, STICKS)
@@ -56,7 +57,7 @@ def flex_scene(
   <!--
 {comment}
   -->
-  <option timestep="{dt:.9g}" gravity="{_numbers(gravity)}" integrator="Euler"/>
+  <option timestep="{dt:.9g}" gravity="{_numbers(gravity)}" integrator="Euler" cone="elliptic"/>
   <size memory="200M"/>
   <worldbody>
     <geom name="floor" type="plane" size="0 0 1" zaxis="0 1 0" friction="{friction:.9g} 0 0" condim="3"/>

@@ -10,6 +10,7 @@ from neuma_lib.evaluation.bands import (
     COVERED,
     LENGTH,
     SILENT,
+    _log_moduli,
     band,
     constants_draws,
     corrected_draws,
@@ -197,6 +198,22 @@ def test_corrected_draws_keep_correlations_of_constants():
 
     slope, plateau = log_spread(corrected(covariance, size=0.02), shear_stress)
     assert plateau < 0.6 * slope
+
+
+def test_uncertainties_of_moduli_follow_from_those_of_the_constants():
+    """K = E / (3 (1 - 2 nu)), G = E / (2 (1 + nu)), and a yield strain in proportion to yield_stress / G."""
+    family, du = Family("x", MISES), 0.1
+    nu = MISES["elasticity"]["nu"]
+    dnu = nu * (1 - nu / 0.5) * du  # nu is the logistic function of u times 0.5
+    for covariance, expected in (
+        (np.diag([du**2, 0, 0]), [du, du, -du]),
+        (np.diag([0, du**2, 0]), [2 * dnu / (1 - 2 * nu), -dnu / (1 + nu), dnu / (1 + nu)]),
+        (np.diag([0, 0, du**2]), [0, 0, du]),
+    ):
+        best = {"law": MISES, "unbounded": family.unbounded_dict(family.guess, covariance)}
+        outputs, result = _log_moduli(best, DT, 0.0)
+        assert outputs[:3] == [("elasticity", 0), ("elasticity", 1), ("plasticity", 0)]
+        np.testing.assert_allclose(result[:3, :3], np.outer(expected, expected), rtol=1e-5, atol=1e-12)
 
 
 def test_errors_that_all_images_share_widen_corrected_draws():

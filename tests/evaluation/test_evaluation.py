@@ -8,12 +8,13 @@ import pytest
 import torch
 
 from neuma_lib.errors import NonFiniteError
-from neuma_lib.evaluation.motion import evaluate
+from neuma_lib.evaluation.motion import energy_gain_after, evaluate
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.law import Elasticity, Law
 from neuma_lib.methods.model import LawOnGrid
-from neuma_lib.sim.prediction import predict
+from neuma_lib.sim.prediction import predict, valid_frames
 from neuma_lib.sim.rollout import rollout
+from neuma_lib.sim.state import Trajectory
 from tests.support.errors import refused
 from tests.support.grounding_scene import HEIGHT, MODEL, PRIOR, RADIUS, TRUTH, ball
 
@@ -190,9 +191,37 @@ def test_an_unstable_motion_gains_energy_before_it_fails():
     assert sound["diverged"] is sound["energy_gain_after_step"] is None
 
 
+def test_the_energy_is_gained_after_the_last_frame_that_has_no_more():
+    """Of frames with 1, 1.005, 1.5, 0.9 and 2 times the initial kinetic energy, without gravity."""
+    body = ball().state(V0)
+    frames, factors = (0, 4, 8, 12, 16), torch.tensor([1.0, 1.005, 1.5, 0.9, 2.0], dtype=torch.float64)
+    x, v, F, C = (value.expand(5, *value.shape) for value in body.motion)
+    path = Trajectory(frames, x, v * factors.sqrt()[:, None, None], F, C)
+    assert energy_gain_after((0.0, 0.0, 0.0), body, path) == 4
+    later = Trajectory(tuple(n + 20 for n in frames[2:]), x[2:], path.v[2:], F[2:], C[2:])
+    assert energy_gain_after((0.0, 0.0, 0.0), body, later) == 0, "before the first frame"
+    sound = Trajectory(frames[:2], x[:2], path.v[:2], F[:2], C[:2])
+    assert energy_gain_after((0.0, 0.0, 0.0), body, sound) is None
+
+
+def test_a_failure_without_a_step_gives_up_one_frame_after_the_other():
+    """And the last frame that can be simulated is held."""
+    tried, body = [], ball().state(V0)
+
+    def simulate(frames):
+        tried.append(list(frames))
+        if len(frames) > 2:
+            raise NonFiniteError("test", "unknown step")
+        return rollout(MODEL, LAW, body, steps=frames[-1], frames=frames)
+
+    path, failure = valid_frames(simulate, (0, 4, 8, 12))
+    assert tried == [[0, 4, 8, 12], [0, 4, 8], [0, 4]] and failure.step is None
+    assert path.frames == (0, 4, 4, 4) and torch.equal(path.x[3], path.x[1])
+
+
 def test_a_floor_of_other_counts_is_refused():
-    (truth, again) = true_tracers(ball(), IN_FLIGHT, in_ball(40, 0), in_ball(40, 1))
-    with refused("evaluation.tracers"):
+    (truth, again) = true_tracers(ball(), IN_FLIGHT, in_ball(40, 0), in_ball(41, 1))
+    with refused("evaluation.tracers", problem="the truth has 40 and 41 tracers, the prediction has 50"):
         evaluate(MODEL, LawOnGrid(LAW), ball().state(V0), IN_FLIGHT, truth, again, in_ball(50, 2))
 
 
@@ -207,3 +236,4 @@ def test_a_motion_that_stays_finite_is_the_rollout():
     with torch.no_grad():
         expected = rollout(MODEL, LAW, body.state(V0), steps=40, frames=frames)
     assert failure is None and torch.equal(path.x, expected.x) and torch.equal(path.F, expected.F)
+    assert path.F_total is None, "only on request"

@@ -38,8 +38,9 @@ MAPPED = [(engine, *names) for engine in ENGINES for names in RULES[engine]]
 
 
 def spec_of(elastic, plastic="identity", **constants):
+    moduli = {key: constants.pop(key, value) for key, value in MODULI.items()}
     part = {"name": plastic, **CONSTANTS[plastic], **constants}
-    return {"elasticity": {"name": elastic, **MODULI}, "plasticity": part}
+    return {"elasticity": {"name": elastic, **moduli}, "plasticity": part}
 
 
 def states(count=200, size=0.08, J=None, seed=0):

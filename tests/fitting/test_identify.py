@@ -17,7 +17,7 @@ from neuma_lib.errors import NonFiniteError
 from neuma_lib.fitting.families import Family
 from neuma_lib.fitting.family_run import FamilyRun
 from neuma_lib.fitting.frame_batches import check_contact, first_contact
-from neuma_lib.fitting.identified import FamilyFit
+from neuma_lib.fitting.identified import FamilyFit, Identified
 from neuma_lib.fitting.identify import _better_later, _prune, _select, identify
 from neuma_lib.fitting.least_squares import (
     BLOCKS,
@@ -607,6 +607,8 @@ def test_a_published_law_gives_what_the_family_has():
     family = Family("plastic", PLASTIC)
     known = {"E": 1e5, "nu": -0.2, "friction_angle": 25.0}
     assert family.with_guesses(known) == {"E": 1e5, "nu": 0.3, "yield_stress": 4e3}
+    bounds = {"E": 0.0, "nu": 0.0, "yield_stress": 0.0}  # have no logarithm or logit
+    assert family.with_guesses(bounds) == family.with_guesses({})
 
 
 def test_combinations_are_those_of_the_covariance():
@@ -633,6 +635,19 @@ def test_errors_that_all_images_share_are_part_of_every_uncertainty():
     assert [each["log_std"] for each in fit.combinations(options)] == pytest.approx([0.07, 0.07])
     stds = [each["log_std"] for each in fit.as_dict(options)["quantities"].values()]
     assert stds == pytest.approx([0.07] * len(stds))
+
+
+def test_a_summary_lists_what_is_determined_and_what_is_not():
+    family = Family("plastic", PLASTIC)
+    values = {"E": 6e4, "nu": 0.3, "yield_stress": 4e3}
+    fit = FamilyFit(family, values, 1.0, covariance=np.diag([0.25, 1e-8, 1e-8]))
+    options = settings({"hencky": ELASTIC})
+    text = Identified(fit, ["other"], {}, [], [], 0, 24, options).summary()
+    assert text.startswith("plastic (tie with other): E = 6e+04, nu = 0.3, yield_stress = 4000; determined: ")
+    determined, rest = text.partition("; determined: ")[2].split("; not determined: ")
+    assert "yield_stress" in determined.split(", ") and "E" in rest.split(", ")
+    sure = replace(fit, covariance=1e-8 * np.eye(3))
+    assert "not determined" not in Identified(sure, [], {}, [], [], 0, 24, options).summary()
 
 
 def test_images_are_averaged_over_squares():

@@ -12,12 +12,13 @@ import h5py
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from neuma_lib.cli import main
 from neuma_lib.evaluation.metrics import tracer_errors
 from neuma_lib.evaluation.scoring import score_positions
 from neuma_lib.geometry.chamfer import chamfer_sequence
-from neuma_lib.io.datasets.benchmark import LAYOUTS, PARTS, write_scene
+from neuma_lib.io.datasets.benchmark import LAYOUTS, PARTS, frame_numbers, write_scene
 from neuma_lib.io.datasets.layouts import take_video
 from neuma_lib.io.files import read_json
 from neuma_lib.io.hdf5 import read_arrays, write_arrays
@@ -111,6 +112,25 @@ def test_pac_nerf_has_mattes_and_backgrounds(data, tmp_path):
     inside = original.images[..., 3] > 0
     assert np.array_equal(images.images[inside], original.images[inside])
     assert not images.images[~inside, 3].any()
+
+
+def test_the_code_of_pac_nerf_can_read_its_layout(data, tmp_path):
+    """It needs poses (3, 4), one background a camera, and colours that equal the background outside of the body."""
+    write_scene("pac_nerf", data, tmp_path, "Ball", {})
+    entries = read_json(tmp_path / "Ball/all_data.json")
+    numbers = [tuple(map(int, Path(entry["file_path"]).stem.split("_")[1:])) for entry in entries]
+    assert sorted(numbers) == [(camera, frame) for camera in range(3) for frame in range(-1, 4)]
+    assert all(np.shape(entry["c2w"]) == (3, 4) for entry in entries)
+    pixels = {n: np.asarray(Image.open(tmp_path / "Ball" / e["file_path"])) for n, e in zip(numbers, entries)}
+    for (camera, frame), image in pixels.items():
+        if frame >= 0:
+            outside = image[..., 3] == 0
+            assert np.array_equal(image[outside, :3], pixels[camera, -1][outside])
+
+
+def test_frames_of_shipped_scenes_can_be_counted(loaded):
+    scenes = [*loaded.tables["table1"].scenes, *loaded.random_scenes]
+    assert len(scenes) == 18 and all(len(frame_numbers(loaded.frame_steps(name))) == 33 for name in scenes)
 
 
 def test_frames_that_cannot_be_counted_and_folders_that_exist_are_refused(data, tmp_path):

@@ -8,8 +8,10 @@ import pytest
 
 from neuma_lib.config import simulation
 from neuma_lib.config.base import Section
+from neuma_lib.config.laws import LawConfig
 from neuma_lib.config.variants import SEEDS, parse_replicate, replicate_folder
 from neuma_lib.errors import InputError
+from neuma_lib.fitting.families import FAMILIES
 from neuma_lib.project import cases, loading
 from neuma_lib.project.page import PAGE, SCHEMA, settings_markdown, settings_schema
 from neuma_lib.project.settings import Config
@@ -481,6 +483,11 @@ def test_every_section_and_key_is_explained():
     assert len(kinds) > 20
     for kind in kinds:
         assert kind.__doc__ and all(entry.description for entry in kind.model_fields.values()), kind.__name__
+
+
+def test_families_of_the_library_are_those_of_the_shipped_settings(loaded):
+    shipped = {name: law.plain() for name, law in loaded.identify.families.items()}
+    assert {name: LawConfig(**spec).plain() for name, spec in FAMILIES.items()} == shipped
 
 
 def test_page_and_schema_are_up_to_date():

@@ -88,6 +88,17 @@ def test_distances_are_those_of_the_nearest_point_of_the_surface(name):
     assert outside.sum() > 50 and on_surface.abs().max() < 1e-12
 
 
+@pytest.mark.parametrize("normal", [(0.0, 2.0, 0.0), (0.0, -0.5, 0.0), (3.0, 0.0, 0.0), (-0.2, 0.7, 1.9)])
+def test_a_plane_has_the_distance_from_its_point_along_its_normal(normal):
+    """However long the normal is."""
+    n = torch.tensor(normal, dtype=torch.float64)
+    n, point = n / n.norm(), torch.tensor([0.2, 0.5, 0.4], dtype=torch.float64)
+    x = torch.rand(20, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    distance, normals = Collider.plane(point.tolist(), normal, friction=0.3).surface(x)
+    torch.testing.assert_close(distance, (x - point) @ n, rtol=0, atol=1e-12)
+    torch.testing.assert_close(normals, n.expand(20, 3), rtol=0, atol=1e-12)
+
+
 def test_a_pose_follows_velocity_and_spin():
     """The velocity of a point that is fixed in the collider is the change of its place."""
     collider = replace(SHAPES["box"], **MOTION)

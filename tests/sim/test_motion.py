@@ -49,6 +49,17 @@ def test_a_later_motion_continues(motion):
             torch.testing.assert_close(own, expected, rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("motion", [{"keyframes": KEYFRAMES}, {"velocity": (1, 2, 3), "spin": (0, 4, 5)}])
+def test_an_object_at_rest_stays_in_its_first_pose(motion):
+    collider = Collider("sphere", (0.1,), **motion)
+    still = collider.at_rest()
+    assert not still.moves and still.velocity == still.spin == REST and still.keyframes == ()
+    for time in (0.0, 0.5):
+        for own, expected in zip(still.pose(time), collider.pose(0.0), strict=True):
+            torch.testing.assert_close(own, expected, rtol=0, atol=1e-12)
+    assert still.at_rest() is still
+
+
 @pytest.mark.parametrize("time", [0.05, 0.17, 0.28, 0.4])
 def test_the_velocity_is_the_change_of_the_pose(time):
     """A point that is fixed in the frame moves with `velocity_at`; `fastest` is an upper bound in the cube."""

@@ -274,6 +274,43 @@ def test_checkpoints_do_not_change_the_gradient(cache_bytes, segment, total):
         assert_equal(grads, expected[-len(grads) :])
 
 
+@pytest.mark.parametrize("keeps_grids", [False, True])
+@pytest.mark.parametrize(("total", "contact"), [(False, False), (True, False), (False, True)])
+def test_a_plan_is_the_longest_segment_that_fits(keeps_grids, total, contact):
+    """Against a list of the sizes of all plans, in the order of preference."""
+    steps, N, nodes, item = 13, 100, 500, 4
+    state = item * N * (24 + 9 * total + 3 * contact)  # x, v, C, F; F_total; tangential displacement
+    step = item * (18 * N + 8 * nodes * keeps_grids)  # tau, F_trial; two grids
+    shared = 0 if keeps_grids else item * (12 * nodes + 9 * N)
+    sizes = {(steps, False): state * (steps + 1) + step + shared}  # all states, without checkpoints
+    for caches in (True, False):
+        for segment in range(steps, 0, -1):
+            kept = step * (segment if caches else 1)
+            sizes.setdefault(
+                (segment, caches), state * (segment + 1 + math.ceil(steps / segment)) + kept + shared
+            )
+    options = dict(total=total, contact=contact, keeps_grids=keeps_grids)
+
+    def plan(memory, cache_bytes=math.inf):
+        return plan_memory(steps, N, nodes, item, cache_bytes, memory, **options)
+
+    whole = sizes.pop((steps, False))
+    for memory in sorted({*sizes.values(), *(size - 1 for size in sizes.values())}):
+        if min(sizes.values()) <= memory < whole:
+            expected = next(key for key, size in sizes.items() if size <= memory)
+            assert plan(memory) == MemoryPlan(*expected, 0)
+    assert plan(whole) == MemoryPlan(steps, False, 0)
+    assert plan(whole + steps * step + 7) == MemoryPlan(steps, True, 7)
+    assert plan(None, steps * step - 1) == MemoryPlan(steps, False, 0)
+    assert plan(None, steps * step) == MemoryPlan(steps, True, 0) and plan(None, 0) == MemoryPlan(
+        steps, False, 0
+    )
+    least = min(*sizes.values(), whole)
+    problem = f"{(least - 1) / 2**30:.3g} GiB must be at least {least / 2**30:.3g} GiB"
+    with refused("memory", problem=problem):
+        plan(least - 1)
+
+
 def test_too_little_memory():
     with refused("memory"):
         gradients(MPM(14, DT), make_law("neural"), scene(TOUCHING), (13,), memory=1000)

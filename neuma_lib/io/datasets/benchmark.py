@@ -132,19 +132,24 @@ def _write_neuma(
 def _write_pac_nerf(
     folder: Path, video: Sequence[_Picture], photographs: Sequence[_Picture], time: np.ndarray
 ) -> None:
-    numbers, entries, backgrounds = frame_numbers([each.step for each in video]), [], {}
+    """Their code requires poses (3, 4), and ignores alpha: it compares colours with the background."""
+    numbers, entries = frame_numbers([each.step for each in video]), []
+    backgrounds: dict[int, np.ndarray] = {}
     for each in video:
-        number = numbers[each.step]
+        number, camera = numbers[each.step], {**each.camera(), "c2w": each.pose[:3]}
         name = f"./data/r_{each.view}_{number}.png"
         each.copy(folder / name)
-        # Their code masks images by itself and keeps the result on white, which these files replace.
-        alpha = each.pixels[..., 3:] / 255
-        _save(folder / f"data/m_{each.view}_{number}.png", each.pixels[..., :3] * alpha + 255 * (1 - alpha))
-        entries.append({"file_path": name, "time": float(time[number]), **each.camera()})
+        entries.append({"file_path": name, "time": float(time[number]), **camera})
+        colours, alpha = each.pixels[..., :3], each.pixels[..., 3:]
+        matte = colours * (alpha / 255) + (255 - alpha)
+        _save(folder / f"data/m_{each.view}_{number}.png", matte)
         if each.view not in backgrounds:
-            backgrounds[each.view] = {"file_path": f"./data/r_{each.view}_{BACKGROUND}.png", **each.camera()}
-            _save(folder / backgrounds[each.view]["file_path"], np.full_like(each.pixels[..., :3], 255))
-    write_json(folder / "all_data.json", [*backgrounds.values(), *entries])
+            backgrounds[each.view] = np.zeros_like(colours)
+            entries.append({"file_path": f"./data/r_{each.view}_{BACKGROUND}.png", **camera})
+        np.copyto(backgrounds[each.view], colours, where=alpha == 0)
+    for view, pixels in backgrounds.items():
+        _save(folder / f"data/r_{view}_{BACKGROUND}.png", pixels)
+    write_json(folder / "all_data.json", entries)
     _write_photographs(folder, photographs)
 
 
