@@ -318,7 +318,7 @@ def report(scene: BenchmarkScene, device: torch.device, batch: int) -> list[str]
             f"| {part.name} | {1e6 * part.seconds:.1f} | {part.calls:.0f} | {1e3 * part.seconds * part.calls:.1f} | "
             f"{100 * part.seconds * part.calls / total:.0f} % | {1e6 * floor:.1f} | {part.seconds / floor:.1f} |"
         )
-    gibibytes = f"{memory / 2**30:.2f} GiB" if memory == memory else "not counted"
+    gibibytes = f"{memory / 2**30:.2f} GiB"
     step, (slow, fast) = twin_step(scene, device), twin_render(device)
     drawn, by_images = compared_renders(scene, device, batch)
     lines += [
