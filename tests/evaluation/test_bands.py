@@ -216,6 +216,20 @@ def test_uncertainties_of_moduli_follow_from_those_of_the_constants():
         np.testing.assert_allclose(result[:3, :3], np.outer(expected, expected), rtol=1e-5, atol=1e-12)
 
 
+def test_a_long_motion_is_represented_by_every_nth_state(monkeypatch):
+    law, F = structured_law(MISES, DT), states(0.05)
+    options = dict(model_std=0.0, spread=3.0, dt=DT, count=5, seed=0)
+
+    def curves(visited):
+        draws = corrected_draws(law, fit()["best"], visited, **options)
+        return torch.stack([sheared(each, torch.tensor([0.02], dtype=torch.float64)) for each in draws])
+
+    sparse = curves(F[::4])
+    assert not torch.equal(curves(F), sparse)
+    monkeypatch.setattr("neuma_lib.evaluation.bands.STATES", 99)
+    assert torch.equal(curves(F), sparse)
+
+
 def test_errors_that_all_images_share_widen_corrected_draws():
     """Images without any error leave `model_std` of every modulus."""
     shear = torch.tensor([0.01], dtype=torch.float64)

@@ -589,6 +589,23 @@ def test_unbounded_constants_return_and_stay_within_bounds_and_the_time_step():
         assert number == pytest.approx(COURANT_LIMIT, rel=1e-3) or values["E"] < 1e-3
 
 
+def test_constants_between_any_bounds_are_unbounded_and_return():
+    """Also those whose lower bound is not 0: exponents from 0.2, angles from -180 degrees."""
+    flow = {"name": "herschel_bulkley", "consistency": 8.0, "exponent": 2.0, "yield_stress": 30.0}
+    fibres = {"name": "fibre_reinforced", "E": 3e4, "nu": 0.2, "fibre_modulus": 1e5, "fibre_exponent": 2.0}
+    paste = Family("paste", {"elasticity": {"name": "hencky", "E": 3e4, "nu": 0.2}, "plasticity": flow})
+    tendon = Family("tendon", {"elasticity": {**fibres, "azimuth": -120.0, "elevation": 25.0}})
+    for family, low, high in (
+        (paste, {"exponent": 0.2}, {"exponent": 3.0}),
+        (tendon, {"azimuth": -180.0}, {}),
+    ):
+        u = family.unbounded(family.guess)
+        assert family.bounded(u) == pytest.approx(family.guess, rel=1e-12)
+        for bounds, far in ((low, -100.0), (high, 100.0)):
+            values = family.bounded(np.where([key in bounds for key in family.constants], far, u))
+            assert {key: values[key] for key in bounds} == pytest.approx(bounds, rel=1e-4)
+
+
 def test_less_flow_is_towards_the_elastic_limit_and_within_bounds():
     values = {"E": 3e4, "nu": 0.2}
     family = Family("plastic", law("hencky", "von_mises", yield_stress=4e3))

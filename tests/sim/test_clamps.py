@@ -16,7 +16,7 @@ from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.settle import settle
 from neuma_lib.sim.state import State
 from tests.support.errors import refused
-from tests.support.sim_scenes import DENSITY, DT, cube, make_law, strained
+from tests.support.sim_scenes import DENSITY, DT, cube, make_law, moving_cube, strained
 
 pytestmark = pytest.mark.core
 
@@ -296,3 +296,11 @@ def test_a_clamp_without_particles_is_refused():
     empty = replace(model, clamps=(LEFT, Clamp((0.9, 0.0, 0.0), (1.0, 1.0, 1.0))))
     with refused("clamps[1]"):
         rollout(empty, make_law("hencky"), start, steps=5, frames=(5,))
+
+
+def test_a_body_without_forces_is_at_rest():
+    """With the default tolerance, in as few steps as must be quiet. Its velocity and spin are removed."""
+    start, model = moving_cube((0.3, -2.0, 0.1), count=100), MPM(16, DT, gravity=(0.0, 0.0, 0.0))
+    settled = settle(model, make_law("hencky"), start, quiet=40, max_steps=120)
+    assert not settled.v.any() and not settled.C.any()
+    torch.testing.assert_close(settled.x, start.x, rtol=0, atol=1e-12)

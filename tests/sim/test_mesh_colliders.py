@@ -234,3 +234,8 @@ def test_wrong_meshes_are_refused():
         DistanceGrid(-np.ones((4, 4, 4)), (0.0, 0.0, 0.0), 0.1)
     with refused("distances.values"):
         DistanceGrid(np.ones(4), (0.0, 0.0, 0.0), 0.1)
+    for face in ([0, 1, 1], [3, 1, 1], [1, 0, 1], [1, 3, 1], [1, 1, 0], [1, 1, 3]):
+        values = np.ones((4, 4, 4))
+        values[tuple(face)] = -1.0
+        with refused("distances.values", problem="leaves the grid"):
+            DistanceGrid(values, (0.0, 0.0, 0.0), 0.1)
