@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import shutil
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -53,6 +54,33 @@ def picture_size(file: Path) -> tuple[int, int]:
     """Width and height in sensor orientation [px]. Raises InputError for a file that is no picture."""
     with open_image(read_regular(file), file) as image:
         return image.size
+
+
+def orientation_of(file: Path) -> int | None:
+    """EXIF orientation of a picture. None without one."""
+    with open_image(read_regular(file), file) as image, reading(file, "an image"):
+        return image.getexif().get(ORIENTATION)
+
+
+@contextmanager
+def evidence(output: str | Path, draw: Callable[[Path], None]) -> Iterator[None]:
+    """If the block raises an `InputError`, draw what the stage saw and name the picture in the message.
+
+    The picture lies next to an output as ``<output>.failed.png``, because Snakemake deletes the outputs of a failed
+    job. It is deleted when the stage runs again.
+
+    Args:
+        output: a picture that the stage writes.
+        draw: writes the picture to a path.
+    """
+    path = Path(output).with_suffix(".failed.png")
+    path.unlink(missing_ok=True)
+    try:
+        yield
+    except InputError as error:
+        draw(path)
+        remedy = f"{error.remedy.rstrip('.')}. " if error.remedy else ""
+        raise InputError(error.where, error.problem, f"{remedy}See {path}") from error
 
 
 def copy_pictures(pictures: Mapping[str, Path], target: str | Path) -> dict[str, Path]:

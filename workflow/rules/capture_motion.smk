@@ -65,6 +65,7 @@ rule capture_flight:
         transforms=of_take_cameras(MATTES),
         reports=of_take_cameras(f"{VIDEO_MASKS}.json"),
         timelines=of_take_cameras(f"{VIDEO_FRAMES}.json"),
+        room=f"{RESULTS}/{{capture}}/room.json",
     output:
         flight=f"{FLIGHT}.json",
         picture=f"{FLIGHT}.png",

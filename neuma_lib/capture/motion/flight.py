@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from neuma_lib.capture.calibration.vertical import Cue, check_vertical
 from neuma_lib.capture.masks.agreement import agreement
 from neuma_lib.capture.masks.regions import centroid
 from neuma_lib.capture.motion.contact import contact_time, lowest_points
@@ -97,7 +98,7 @@ class Flight:
     gravity: str
 
 
-def find_flight(views: Sequence[Filmed], name: str, metric: bool = True) -> Flight:
+def find_flight(views: Sequence[Filmed], name: str, metric: bool = True, cues: Sequence[Cue] = ()) -> Flight:
     """Fit the free flight of a take.
 
     A single camera requires a plane: the vertical one through the middle of the room that faces the camera.
@@ -106,10 +107,11 @@ def find_flight(views: Sequence[Filmed], name: str, metric: bool = True) -> Flig
         views: of the cameras. The first one is the time reference.
         name: of the take for messages.
         metric: whether the room's lengths are metres, so that gravity is checked.
+        cues: upward directions in the room, compared with gravity.
 
     Raises:
-        InputError: a camera shows no free flight, the time between two cameras is undetermined, no flight fits, or
-            gravity is significantly off by more than 10 %.
+        InputError: a camera shows no free flight, the time between two cameras is undetermined, no flight fits,
+            gravity is significantly off by more than 10 %, or its direction contradicts the cues.
     """
     tracks, inside = [], []
     for view in views:
@@ -135,6 +137,8 @@ def find_flight(views: Sequence[Filmed], name: str, metric: bool = True) -> Flig
     contact = _contact(views, inside, fall)
     if np.isfinite(contact):
         fall, kept = fit_flight(tracks, plane, fall.offsets, fixed, contact)
+    if cues:
+        check_vertical([*cues, fall.gravity.cue], name)
     gravity = (
         fall.gravity.check(name, tolerated=TOLERATED_DEVIATIONS) if metric else fall.gravity.describe(name)
     )
@@ -223,5 +227,20 @@ def draw_flight(path: str | Path, flight: Flight, views: Sequence[Filmed], title
         last.plot(1000 * clock, np.linalg.norm(fitted - track.places, axis=1), ".-", label=view.camera)
     last.set(title="off the fit", xlabel="time [ms]", ylabel="[px]", yscale="log")
     last.legend()
+    figure.suptitle(title)
+    save_figure(path, figure)
+
+
+def draw_tracks(path: str | Path, views: Sequence[Filmed], title: str) -> None:
+    """Plot the positions of the object's centre in each camera, and which belong to its free flight."""
+    figure = new_figure(5 * len(views), 5)
+    for axes, view in zip(np.atleast_1d(figure.subplots(1, len(views))), views):
+        axes.imshow(view.pixels[0] // 2 + 127)
+        axes.plot(*view.centroids.T, ".", label="seen")
+        if view.flight is not None:
+            flying = (view.numbers >= view.flight[0]) & (view.numbers <= view.flight[1])
+            axes.plot(*view.centroids[flying].T, "x", label="free flight")
+        axes.set(title=view.camera, xlabel="x [px]", ylabel="y [px]")
+        axes.legend()
     figure.suptitle(title)
     save_figure(path, figure)
