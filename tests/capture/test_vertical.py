@@ -25,12 +25,12 @@ def test_quarter_turns_are_those_of_pillow():
         np.testing.assert_array_equal(np.rot90(stored, -quarters), np.asarray(ImageOps.exif_transpose(image)))
 
 
-def held(count, orientations, roll=4.0, seed=0, arc=2 * np.pi):
+def held(count, orientations, roll=4.0, seed=0, sector=2 * np.pi):
     """Cameras around the origin of a world with z up, in sensor orientation, rolled by some degrees."""
     rng = np.random.default_rng(seed)
     views = []
     for k, orientation in enumerate(orientations):
-        angle, height = arc * k / count, rng.uniform(0.3, 0.8)
+        angle, height = sector * k / count, rng.uniform(0.3, 0.8)
         centre = np.array([np.cos(angle), np.sin(angle), height])
         forward = -centre / np.linalg.norm(centre)
         right = np.cross(forward, (0, 0, 1.0))
@@ -52,7 +52,7 @@ def up_cue(name="floor", tilt=0.0):
 
 
 @pytest.mark.parametrize("orientation", [1, 3, 6, 8])
-def test_cameras_held_by_hand_tell_up_whichever_way_the_sensor_is_turned(orientation):
+def test_up_follows_from_cameras_held_by_hand_whichever_way_the_sensor_is_turned(orientation):
     """Four degrees of roll in 24 photographs leave about one degree."""
     tags = [orientation] * 24
     cameras, exif = camera_cues(held(24, tags), tags)
@@ -71,7 +71,7 @@ def test_some_turned_photographs_without_a_tag_do_not_matter():
 
 def test_photographs_from_one_side_leave_the_direction_uncertain():
     full = camera_cues(held(24, [1] * 24), [None] * 24)[0]
-    side = camera_cues(held(24, [1] * 24, arc=np.radians(25)), [None] * 24)[0]
+    side = camera_cues(held(24, [1] * 24, sector=np.radians(25)), [None] * 24)[0]
     assert side.deviation > 3 * full.deviation
     assert side.angle(up_cue()) < 3 * side.deviation
 

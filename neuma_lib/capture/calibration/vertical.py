@@ -25,7 +25,7 @@ ROLL = 5.0
 _DEVIATIONS = 2.0  # standard deviations by which an angle must exceed the limit
 _ROUNDS = 5  # of direction and quarter turns in turn
 QUARTER_TURNS = {1: 0, 6: 1, 3: 2, 8: 3}
-"""Clockwise quarter turns that bring a stored picture upright, by EXIF orientation."""
+"""Clockwise quarter turns after which a stored picture is upright, by EXIF orientation."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,15 +108,18 @@ def check_vertical(cues: Sequence[Cue], where: str) -> str:
         InputError: two cues differ by more than `MAX_ANGLE` and two standard deviations. It lists all angles.
     """
     angles = {(a.name, b.name): a.angle(b) for a, b in combinations(cues, 2)}
-    apart = [
+    contradictory = [
         (a, b)
         for a, b in combinations(cues, 2)
         if a.angle(b) - _DEVIATIONS * np.hypot(a.deviation, b.deviation) > MAX_ANGLE
     ]
-    if apart:
+    if contradictory:
         listed = ", ".join(f"{a} and {b} {angle:.0f} degrees" for (a, b), angle in angles.items())
-        odd = max((cue for pair in apart for cue in pair), key=lambda c: sum(c in pair for pair in apart))
-        alone = sum(odd in pair for pair in apart) > 1 or len(cues) == 2
+        odd = max(
+            (cue for pair in contradictory for cue in pair),
+            key=lambda c: sum(c in pair for pair in contradictory),
+        )
+        alone = sum(odd in pair for pair in contradictory) > 1 or len(cues) == 2
         raise InputError(
             where,
             f"estimates of the upward direction differ by more than {MAX_ANGLE:.0f} degrees ({listed})"
