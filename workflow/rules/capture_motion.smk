@@ -49,10 +49,10 @@ rule capture_video_masks:
     conda:
         CAPTURE_ENVIRONMENT
     resources:
-        mem_mb=8000,
+        mem_mb=2000,
     params:
         camera="{camera}",
-        rate=VIDEO_RATE,
+        duration=capture_setting("duration"),
         longest=capture_setting("longest"),
         name="{capture}, {take}, {camera}",
     script:

@@ -5,6 +5,7 @@ import shutil
 import numpy as np
 import torch
 
+from neuma_lib.capture.masks.mattes import Mattes, metric_camera
 from neuma_lib.capture.motion.gravity import GRAVITY, Gravity
 from neuma_lib.capture.motion.synchronisation import frame_times
 from neuma_lib.capture.pictures import picture_sheet
@@ -13,7 +14,7 @@ from neuma_lib.capture.registration.rigid_views import Sight
 from neuma_lib.errors import InputError
 from neuma_lib.io.files import atomic, listed, read_json, write_json
 from neuma_lib.io.gaussians import load_gaussians, save_gaussians
-from neuma_lib.io.images import read_image_set, read_transforms
+from neuma_lib.io.images import read_transforms
 from neuma_lib.io.particles import load_particles, save_particles
 from neuma_lib.io.ply import read_ply, write_ply
 from neuma_lib.splatting.rigid import moved
@@ -97,18 +98,19 @@ def main(inputs, output, params, run) -> None:
 
 def sight(camera, transforms, timeline, row_time, flight, name) -> Sight:
     """Frames of one camera during free flight."""
-    data, images = read_transforms(transforms), read_image_set(transforms)
+    mattes = Mattes(transforms)
     first, last = flight["frames"][camera]
-    flying = [k for k, step in enumerate(images.steps) if first <= step <= last]
+    flying = [k for k, frame in enumerate(mattes.frames) if first <= frame["step"] <= last]
     if not flying:
         raise InputError(
             f"{name}, {camera}", f"{transforms} has none of the frames {first} to {last} of the flight"
         )
-    frames, pixels = [data["frames"][k] for k in flying], images.images[flying]
+    frames, pixels = [mattes.frames[k] for k in flying], np.stack([mattes[k] for k in flying])
     rows = np.array([np.flatnonzero(image[..., 3].any(axis=1)).mean() + 0.5 for image in pixels])
     times = frame_times(frames, rows, row_time, read_json(timeline)["height"])
     known = flight["offsets_deviation_s"][camera] == 0
-    return Sight(camera, times, pixels, images.viewmats[0], images.Ks[0], flight["offsets_s"][camera], known)
+    viewmat, K = metric_camera(frames[0], {})
+    return Sight(camera, times, pixels, viewmat, K, flight["offsets_s"][camera], known)
 
 
 def parabola(flight, scale, offset, metric) -> Parabola:

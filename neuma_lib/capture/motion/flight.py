@@ -40,7 +40,7 @@ class Filmed:
         camera: its name.
         numbers: of the frames, (T,).
         times: on its clock [s], (T,).
-        pixels: (T, H, W, 3), uint8.
+        pixels: T pictures, RGB or RGBA, (H, W, 3) or (H, W, 4), uint8.
         masks: (T, H, W).
         flight: numbers of the first and last frame of its first free flight. None without free flight.
         viewmat, K: in the room, (4, 4) and (3, 3).
@@ -53,7 +53,7 @@ class Filmed:
     camera: str
     numbers: np.ndarray
     times: np.ndarray
-    pixels: np.ndarray
+    pixels: Sequence[np.ndarray]
     masks: np.ndarray
     flight: tuple[int, int] | None
     viewmat: np.ndarray
@@ -146,7 +146,9 @@ def find_flight(views: Sequence[Filmed], name: str, metric: bool = True, cues: S
     for number, (view, flying, part) in enumerate(zip(views, inside, kept)):
         used = flying[part]
         frames.append((int(view.numbers[used[0]]), int(view.numbers[used[-1]])))
-        paths += follow(list(view.pixels[used]), view.masks[used], view.row_times[used], number)
+        paths += follow(
+            [view.pixels[i][..., :3] for i in used], view.masks[used], view.row_times[used], number
+        )
     spin = fit_spin(paths, tracks, fall)
     return Flight(fall, spin, frames, tracks, lines, _at_rest(views, fall.offsets), gravity)
 
@@ -218,7 +220,7 @@ def draw_flight(path: str | Path, flight: Flight, views: Sequence[Filmed], title
     *cameras, last = figure.subplots(1, len(views) + 1)
     for number, (axes, view, track) in enumerate(zip(cameras, views, flight.tracks)):
         fitted = flight.fall.seen(track, number)
-        axes.imshow(view.pixels[0] // 2 + 127)
+        axes.imshow(view.pixels[0][..., :3] // 2 + 127)
         axes.plot(*track.places.T, ".", label="seen")
         axes.plot(*fitted.T, "-", label="free flight")
         axes.set(title=view.camera, xlabel="x [px]", ylabel="y [px]")
@@ -235,7 +237,7 @@ def draw_tracks(path: str | Path, views: Sequence[Filmed], title: str) -> None:
     """Plot the positions of the object's centre in each camera, and which belong to its free flight."""
     figure = new_figure(5 * len(views), 5)
     for axes, view in zip(np.atleast_1d(figure.subplots(1, len(views))), views):
-        axes.imshow(view.pixels[0] // 2 + 127)
+        axes.imshow(view.pixels[0][..., :3] // 2 + 127)
         axes.plot(*view.centroids.T, ".", label="seen")
         if view.flight is not None:
             flying = (view.numbers >= view.flight[0]) & (view.numbers <= view.flight[1])
