@@ -305,8 +305,8 @@ class _Decoder:
 
     def changes(self) -> np.ndarray:
         """Mean absolute difference in brightness of each frame but the first from the previous one, (N - 1,)."""
-        found = _CHANGE.findall("\n".join(self._other_messages))
-        return np.array(found, float)
+        changes = _CHANGE.findall("\n".join(self._other_messages))
+        return np.array(changes, float)
 
     def noted_rate(self) -> float | None:
         """Recording rate noted in the file [frames per second], if any."""

@@ -19,7 +19,15 @@ from neuma_lib.capture.calibration.placement import (
 )
 from neuma_lib.capture.calibration.poses import Poses, find_boards
 from neuma_lib.capture.calibration.vertical import MAX_ANGLE, UP, Cue, camera_cues, check_vertical
-from neuma_lib.capture.pictures import group_of, orientation_of, read_picture, undistorted, write_png
+from neuma_lib.capture.pictures import (
+    group_of,
+    orientation_of,
+    picture_name,
+    picture_size,
+    read_picture,
+    undistorted,
+    write_png,
+)
 from neuma_lib.config.capture import CaptureConfig, LengthConfig
 from neuma_lib.errors import InputError
 from neuma_lib.io.images import OPENGL_TO_OPENCV, transform_world, write_transforms
@@ -57,9 +65,17 @@ def find_room(poses: Poses, pictures: Mapping[str, Path], settings: CaptureConfi
         InputError: as `room_of`, or its upward direction contradicts the photographs (`check_vertical`).
     """
     held = [i for i, name in enumerate(poses.names) if group_of(name) == PHOTOGRAPHS]
-    cues = camera_cues(poses.viewmats[held], [orientation_of(pictures[poses.names[i]]) for i in held])
+    sizes = [(poses.lenses[i].width, poses.lenses[i].height) for i in held]
+    orientations = [orientation_of(pictures[poses.names[i]], size) for i, size in zip(held, sizes)]
+    cues = camera_cues(poses.viewmats[held], orientations)
     if settings.poses == "photographs":
         placed = {name: pictures[name] for name in poses.names}
+        for file in settings.length.ends if settings.length else ():
+            name = picture_name(PHOTOGRAPHS, file)
+            size = sizes[held.index(poses.names.index(name))] if name in poses.names else None
+            if size and picture_size(pictures[name]) != size:
+                problem = "the photograph is stored turned, so its pixels are not those of the sensor"
+                raise InputError(f"length.ends.{file}", problem, "Mark the points in other photographs")
         boards = find_boards(placed, settings.board) if settings.board else {}
         room = room_of(poses, boards, settings, cues)
     else:
@@ -107,7 +123,7 @@ def room_of(
 def _metres_per_unit(poses: Poses, length: LengthConfig) -> float:
     views, directions = [], []
     for file, ends in length.ends.items():
-        name = f"{PHOTOGRAPHS}/{file}"
+        name = picture_name(PHOTOGRAPHS, file)
         if name in poses.names:
             i = poses.names.index(name)
             views.append(poses.viewmats[i])
@@ -139,7 +155,7 @@ def write_room(
     photographs = 0
     for name, lens, viewmat in zip(room.poses.names, room.poses.lenses, room.poses.viewmats):
         smaller = lens.pinhole().resized(settings.longest)
-        pixels = undistorted(read_picture(pictures[name]), lens, settings.longest)
+        pixels = undistorted(read_picture(pictures[name], (lens.width, lens.height)), lens, settings.longest)
         file = folder / Path(name).with_suffix(".png")
         write_png(file, pixels)
         group = group_of(name)

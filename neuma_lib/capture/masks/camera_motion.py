@@ -27,9 +27,9 @@ def background_shift(reference: np.ndarray, picture: np.ndarray) -> float:
     points = cv2.goodFeaturesToTrack(first, _POINTS, 0.01, max(first.shape) / 50)
     if points is None or len(points) < _MIN_POINTS:
         return np.nan
-    ahead, found, _ = cv2.calcOpticalFlowPyrLK(first, second, points, None)
+    ahead, tracked, _ = cv2.calcOpticalFlowPyrLK(first, second, points, None)
     back, returned, _ = cv2.calcOpticalFlowPyrLK(second, first, ahead, None)
-    kept = (found.ravel() == 1) & (returned.ravel() == 1)
+    kept = (tracked.ravel() == 1) & (returned.ravel() == 1)
     kept &= np.linalg.norm((back - points)[:, 0], axis=1) < _MAX_RETURN_ERROR
     if kept.sum() < _MIN_POINTS:
         return np.nan

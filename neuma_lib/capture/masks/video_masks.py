@@ -131,6 +131,7 @@ def video_masks(
     _draw_silhouettes(changes, masks, tracks)
     # A hand that holds the object before its flight is allowed.
     check_background(np.where(np.arange(len(frames)) < begin, 0, moving), name)
+    masks[masks.sum(axis=(1, 2)) < min_area(masks[0])] = False
     breaks = []
     if tracks and places is None:
         seen = [appearance(change.frame, mask) for change, mask in zip(changes, masks)]
