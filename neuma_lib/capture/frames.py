@@ -34,8 +34,8 @@ MAX_FRAMES = 100_000
 STEADY = 0.1
 """Relative variation of the frame interval below which the rate is considered constant."""
 _REPEATED = 0.3  # change of a repeated picture relative to those before and after it
+_MIN_PERIODIC, _PERIODIC = 5, 0.6  # repeats, and share of them, that determine a period
 _MAX_REPEATS = 4  # of one picture
-_CHANGE = re.compile(r"lavfi\.signalstats\.YAVG=([\d.e+-]+)")
 _FRAME_INFO = re.compile(r"\bn:\s*(\d+)\s+pts:\s*(-?\d+|NOPTS)\s.*\bs:(\d+)x(\d+)\b")
 _TIME_BASE = re.compile(r"config in time_base:\s*(\d+)/(\d+)")
 _NOTED_RATE = re.compile(
@@ -137,28 +137,40 @@ def timeline_of(report: Mapping[str, Any]) -> Timeline:
 def repeated_frames(changes: np.ndarray) -> np.ndarray:
     """Numbers of the frames that repeat the previous picture.
 
-    New pictures differ at least by noise. A repeated one differs far less than its neighbours, by compression alone. In
-    a scene at rest without noise all frames are equal, and none is reported.
+    A repeated picture differs far less than its neighbours, by compression alone, everywhere in the picture.
+    Compression also repeats the background of new pictures, so the mean difference alone is not sufficient. In a scene
+    at rest all frames may be equal, and none is reported, unless repeats in motion have a period.
 
     Args:
-        changes: mean absolute difference of each frame but the first from the previous one, (N - 1,).
+        changes: mean and maximum absolute difference of each frame but the first from the previous one, (N - 1, 2).
     """
-    padded = np.concatenate([[np.nan], changes, [np.nan]])
+    padded = np.pad(changes, ((1, 1), (0, 0)), constant_values=np.nan)
     inner, ends = [], []
     k = 1
     while k <= len(changes):
         # The longest run of small changes from k on, compared with the changes on both sides of it.
         for end in range(min(k + _MAX_REPEATS, len(changes) + 1), k, -1):
             sides = padded[[k - 1, end]]
-            if padded[k:end].max() < _REPEATED * np.nanmin(sides, initial=np.inf) < np.inf:
+            limit = np.nanmin(sides, axis=0, initial=np.inf)
+            if (padded[k:end] < _REPEATED * limit).all() and np.isfinite(limit).all():
                 (ends if np.isnan(sides).any() else inner).extend(range(k, end))
                 break
         else:
             end = k + 1
         k = end
     # At an end of the video, rest looks the same, so others must repeat, too.
-    repeated = sorted(inner + ends) if len(inner) > 2 else inner
-    return np.array(repeated, int)
+    repeated = np.array(sorted(inner + ends) if len(inner) > 2 else inner, int)
+    if len(repeated) < _MIN_PERIODIC:
+        return repeated
+    steps = np.diff(repeated)
+    period = int(np.bincount(steps).argmax())
+    phase = int(np.bincount(repeated % period).argmax())
+    if period > 1 and min((steps == period).mean(), (repeated % period == phase).mean()) > _PERIODIC:
+        mean = padded[:, 0]
+        others = np.arange(phase or period, len(changes), period)
+        others = others[mean[others] < np.fmin(mean[others - 1], mean[others + 1])]
+        repeated = np.union1d(repeated, others)
+    return repeated
 
 
 def check_times(times: Sequence[float], path: str | Path) -> np.ndarray:
@@ -304,9 +316,10 @@ class _Decoder:
             raise InputError(self.path, f"cannot be read as a video ({reason})", f"{_AGAIN}, or remove it")
 
     def changes(self) -> np.ndarray:
-        """Mean absolute difference in brightness of each frame but the first from the previous one, (N - 1,)."""
-        changes = _CHANGE.findall("\n".join(self._other_messages))
-        return np.array(changes, float)
+        """Mean and maximum difference in brightness of each frame but the first from the previous one, (N - 1, 2)."""
+        text = "\n".join(self._other_messages)
+        columns = (re.findall(rf"lavfi\.signalstats\.{name}=([\d.e+-]+)", text) for name in ("YAVG", "YMAX"))
+        return np.array(list(zip(*columns)), float).reshape(-1, 2)
 
     def noted_rate(self) -> float | None:
         """Recording rate noted in the file [frames per second], if any."""
@@ -322,7 +335,7 @@ def _decoder(path: str | Path, pixels: bool) -> Iterator[_Decoder]:
     output = ["-f", "rawvideo", "-pix_fmt", "rgb24", "pipe:1"] if pixels else ["-f", "null", "-"]
     # V excludes cover pictures. ffmpeg rotates pictures upright before they reach a filter.
     command = [*ffmpeg_input(path, "-hide_banner", "-xerror"), "-map", "0:V:0"]
-    compared = ",tblend=all_mode=difference,signalstats,metadata=print:key=lavfi.signalstats.YAVG"
+    compared = ",tblend=all_mode=difference,signalstats,metadata=print"
     command += [
         "-vf",
         f"showinfo=checksum=0{'' if pixels else compared}",
