@@ -15,9 +15,8 @@ from neuma_lib.capture.tools import new_figure, save_figure
 from neuma_lib.errors import InputError
 
 MIN_MEAN_IOU = 0.7
-"""Mean IoU of the masks of photographs with their visual hull before they are refined. Refined masks always agree."""
-MAX_CUT = 0.3
-"""Share of the photographs whose masks touch the border. A mask with furniture in it usually does."""
+"""Mean IoU of the masks of photographs with their visual hull before they are refined. Refined masks always agree.
+16 real photographs of a plush figure, of which 5 masks contain bedclothes or lack a part, have 0.78."""
 BELOW_FLOOR, ABOVE_FLOOR = 0.1, 0.15
 """Distance of the lowest part of a body below and above the floor, relative to its height."""
 VOLUME_RATIO = (0.6, 1.25)
@@ -26,15 +25,10 @@ _QUANTILE = 0.01  # of the heights, to which single stray Gaussians do not matte
 _OWN_MASKS = "put masks of the object alone into the folder masks/photographs, white where the object is"
 
 
-def check_masks(ious: Sequence[float], cut: Sequence[bool], where: str) -> None:
-    """Check the masks of photographs before they are refined.
+def check_masks(ious: Sequence[float], where: str) -> None:
+    """Raises InputError if masks of photographs do not show one body before they are refined.
 
-    Args:
-        ious: of each mask with the visual hull (`neuma_lib.capture.masks.agreement.agreement`).
-        cut: whether it touches the border of its picture.
-
-    Raises:
-        InputError: they do not show one body, or something larger than the pictures.
+    ``ious`` are those of each mask with the visual hull (`neuma_lib.capture.masks.agreement.agreement`).
     """
     if len(ious) > 1 and np.mean(ious) < MIN_MEAN_IOU:
         raise InputError(
@@ -42,13 +36,6 @@ def check_masks(ious: Sequence[float], cut: Sequence[bool], where: str) -> None:
             f"the masks of photographs do not show one body: their mean IoU with the common visual hull is"
             f" {np.mean(ious):.2f}, at least {MIN_MEAN_IOU} is required",
             f"Photograph the object alone, in front of a plain background of another colour, or {_OWN_MASKS}",
-        )
-    if np.mean(cut) > MAX_CUT:
-        raise InputError(
-            where,
-            f"{np.sum(cut)} of {len(cut)} masks of photographs touch the border of the picture, at most {MAX_CUT:.0%}"
-            " may. Usually furniture or the wall is in the masks",
-            f"Photograph the whole object from farther away, alone, or {_OWN_MASKS}",
         )
 
 

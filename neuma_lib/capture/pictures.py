@@ -115,7 +115,10 @@ def evidence(output: str | Path, draw: Callable[[Path], None]) -> Iterator[None]
     try:
         yield
     except InputError as error:
-        draw(path)
+        try:
+            draw(path)
+        except InputError:
+            raise error from None  # what cannot be drawn is often the problem itself
         remedy = f"{error.remedy.rstrip('.')}. " if error.remedy else ""
         raise InputError(error.where, error.problem, f"{remedy}See {path}") from error
 

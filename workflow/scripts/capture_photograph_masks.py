@@ -18,7 +18,7 @@ from neuma_lib.capture.masks.mattes import (
     write_mattes,
 )
 from neuma_lib.capture.masks.photograph_masks import photograph_mask
-from neuma_lib.capture.masks.regions import cut_off, overlay
+from neuma_lib.capture.masks.regions import overlay
 from neuma_lib.capture.masks.saliency import Saliency
 from neuma_lib.capture.pictures import evidence, picture_sheet, read_picture
 from neuma_lib.config.board import BoardConfig
@@ -67,7 +67,7 @@ def main(inputs, output, params, run) -> None:
             ious = agreement(masks, cameras, Ks)
             unrefined = [k for k, own_one in enumerate(is_own) if not own_one]
             if unrefined:
-                check_masks(ious[unrefined], [cut_off(masks[k]) for k in unrefined], params.name)
+                check_masks(ious[unrefined], params.name)
 
         def progress(done: int, total: int) -> None:
             run.progress(total + (_STEPS - 1) * done, _STEPS * total)

@@ -8,8 +8,8 @@ import torch
 from neuma_lib.capture.masks.mattes import Mattes, metric_camera
 from neuma_lib.capture.motion.gravity import GRAVITY, Gravity
 from neuma_lib.capture.motion.synchronisation import frame_times
-from neuma_lib.capture.pictures import picture_sheet
-from neuma_lib.capture.registration.registration import Parabola, register
+from neuma_lib.capture.pictures import evidence, picture_sheet
+from neuma_lib.capture.registration.registration import Parabola, check_overlap, register
 from neuma_lib.capture.registration.rigid_views import Sight
 from neuma_lib.errors import InputError
 from neuma_lib.io.files import atomic, listed, read_json, write_json
@@ -55,7 +55,13 @@ def main(inputs, output, params, run) -> None:
         f"the placed object in {registered.pictures[0]} pictures",
         len(sights) > 1,
     )
-    line = gravity.check(params.name) if scale_known else gravity.describe(params.name)
+
+    def draw(path) -> None:
+        draw_comparisons(path, registered, params.name)
+
+    with evidence(output.picture, draw):
+        check_overlap(registered, params.name)
+        line = gravity.check(params.name) if scale_known else gravity.describe(params.name)
     placed = registered.place(x.double().numpy())
     if placed.min() < 0 or placed.max() > 1:
         raise InputError(
@@ -77,23 +83,23 @@ def main(inputs, output, params, run) -> None:
         save_particles(target, placed.to(x), registered.scale**3 * vol0, attributes)
     with atomic(output.binding) as partial:
         shutil.copyfile(inputs.binding, partial)
-    pictures = []
-    for compared in registered.comparisons:
-        triple = [compared.seen, compared.rendered, (1 + compared.rendered - compared.seen) / 2]
-        pixels = np.rint(255 * np.concatenate(triple, axis=1)).astype(np.uint8)
-        pictures.append(
-            (
-                f"{registered.names[compared.camera]}, {compared.time:.4f} s: seen, rendered, difference",
-                pixels,
-            )
-        )
-    picture_sheet(output.picture, pictures, f"{params.name}: {registered.summary()}", columns=3)
+    draw(output.picture)
     write_json(output.velocity, registered.velocity())
     write_json(output.registration, {**registered.report(), **gravity.report(), "gravity": line})
     run.log(registered.summary())
     run.log(line)
     if registered.ambiguous:
         run.log(f"undetermined: {registered.ambiguous}")
+
+
+def draw_comparisons(path, registered, name) -> None:
+    pictures = []
+    for compared in registered.comparisons:
+        triple = [compared.seen, compared.rendered, (1 + compared.rendered - compared.seen) / 2]
+        pixels = np.rint(255 * np.concatenate(triple, axis=1).clip(0, 1)).astype(np.uint8)
+        camera = registered.names[compared.camera]
+        pictures.append((f"{camera}, {compared.time:.4f} s: seen, rendered, difference", pixels))
+    picture_sheet(path, pictures, f"{name}: {registered.summary()}", columns=3)
 
 
 def sight(camera, transforms, timeline, row_time, flight, name) -> Sight:
