@@ -208,6 +208,20 @@ def _parser() -> argparse.ArgumentParser:
     _add_material_options(scene_export)
     scene_export.add_argument("--configfile", nargs="+", default=[], metavar="FILE", help=CONFIGFILE)
 
+    clip = _command(
+        commands,
+        _clip,
+        "clip: measure the flight of an object in one video",
+        "Measures gravity, spin and rebound in a video of a fixed camera, without photographs or calibration. Writes "
+        "clip.md, clip.json and pictures. Example: neuma clip ball.mp4 results/ball --diameter 0.067",
+    )
+    clip.add_argument(
+        "video", metavar="VIDEO", help="video of the flight, filmed from the side by a fixed camera"
+    )
+    clip.add_argument("folder", metavar="FOLDER", help="folder of the results")
+    width = "width of the object across its longer axis [m]; without it, the width follows from gravity"
+    clip.add_argument("--diameter", type=float, metavar="METRES", help=width)
+
     timings = _command(
         commands,
         _timings,
@@ -279,6 +293,17 @@ def _new_capture(options: argparse.Namespace) -> None:
     print(f"  copy your files to {folder}/photos, {folder}/stills and {folder}/videos")
     print(f"  neuma check {file}")
     print(f"  snakemake --cores 2 results/{options.name}/capture.md")
+
+
+def _clip(options: argparse.Namespace) -> None:
+    from neuma_lib.capture.clip import analyse_clip, checks
+
+    if options.diameter is not None and not options.diameter > 0:
+        raise InputError("--diameter", f"{options.diameter:g} must be above 0")
+    for check in checks(analyse_clip(options.video, options.folder, options.diameter)):
+        expected = f" (expected: {check.wanted})" if check.wanted else ""
+        print(f"{check.what}: {check.value}{expected}")
+    print(f"Report: {Path(options.folder) / 'clip.md'}")
 
 
 def _check(options: argparse.Namespace) -> int:

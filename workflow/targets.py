@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from difflib import get_close_matches
@@ -10,6 +11,7 @@ from pathlib import Path
 
 from neuma_lib.errors import InputError
 
+_PLAIN = re.compile(r"[A-Za-z0-9_+=.~-]+")  # folders of results, with seeds and options
 _TRIED = 300  # combinations of similar words for a target
 
 
@@ -52,6 +54,12 @@ def refuse_unknown(
                 target,
                 "no rule makes this file with these settings",
                 f"Add --configfile {' '.join(missing)} --",
+            )
+        if odd := [part for part in Path(target).parts[1:-1] if not _PLAIN.fullmatch(part)]:
+            raise InputError(
+                target,
+                f"'{odd[0]}' cannot name a folder of results: it may have letters without accents, digits, - and _",
+                "Rename the capture's folder, and use the new name here",
             )
         remedy = f"Similar: {', '.join(near)}" if near else "`neuma check` lists scenes and tables"
         raise InputError(target, "no rule makes this file, and it does not exist", remedy)

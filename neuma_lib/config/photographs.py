@@ -19,6 +19,9 @@ class PhotographsConfig(Section):
         0.9, "share of masks that contain a point of the reference body", gt=0.5, le=1
     )
     lacking: float = internal(0.1, "share of that body that a mask may lack; 1: no limit", gt=0, le=1)
+    min_psnr: float = internal(
+        15.0, "PSNR of held-out photographs inside the object below which the reconstruction stops [dB]"
+    )
     # Decays to a tenth. 0: equal exposure and white balance.
     gain_rate: float = internal(0.01, "learning rate of the log exposure of a photograph, by channel", ge=0)
     edge: float = internal(0.03, "edge length of the repaired surface, relative to the body", gt=0, le=0.2)

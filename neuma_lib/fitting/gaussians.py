@@ -216,7 +216,7 @@ def _exposed(sh: Tensor, gain: Tensor) -> Tensor:
     return torch.cat([scaled[:, :1] + 0.5 * (gain - 1) / SH_C0, scaled[:, 1:]], dim=1)
 
 
-def _render(gaussians: Gaussians, sh: Tensor, camera: Cameras) -> tuple[Tensor, Tensor]:
+def render_over_white(gaussians: Gaussians, sh: Tensor, camera: Cameras) -> tuple[Tensor, Tensor]:
     """Image over white (H, W, 3) and its alpha (H, W)."""
     pictures, alphas = rasterize(
         gaussians.means[None], gaussians.covars()[None], gaussians.opacities, sh, camera.viewmats, camera.Ks,
@@ -227,7 +227,7 @@ def _render(gaussians: Gaussians, sh: Tensor, camera: Cameras) -> tuple[Tensor, 
 
 def _exposure(gaussians: Gaussians, views: _Views, view: int) -> Tensor:
     """Least-squares gain (3,) between the render and an image inside the object."""
-    picture, alpha = _render(gaussians, gaussians.sh(), views.cameras[view])
+    picture, alpha = render_over_white(gaussians, gaussians.sh(), views.cameras[view])
     rgba = views.images[view]
     inside = rgba[..., 3] > 0.5
     colour, target = (picture - (1 - alpha[..., None]))[inside], (rgba[..., :3] * rgba[..., 3:])[inside]
@@ -242,7 +242,7 @@ def _evaluate(
 
     def error(view: int) -> tuple[Tensor, Tensor]:
         exposed = sh if exposures is None else _exposed(sh, exposures[view])
-        picture, _ = _render(gaussians, exposed, views.cameras[view])
+        picture, _ = render_over_white(gaussians, exposed, views.cameras[view])
         rgba = views.images[view]
         white = rgba[..., :3] * rgba[..., 3:] + 1 - rgba[..., 3:]
         return (picture.clamp(0, 1) - white) ** 2, rgba[..., 3]

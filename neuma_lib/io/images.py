@@ -272,13 +272,15 @@ def _read_all(files: Sequence[Path], frames: Sequence[Mapping[str, Any]], path: 
     return images
 
 
-def open_image(content: bytes, where: str | Path, sha256: str | None = None) -> Image.Image:
+def open_image(
+    content: bytes, where: str | Path, sha256: str | None = None, formats: Sequence[str] = FORMATS
+) -> Image.Image:
     """An image of which only the header is read. Checks the format, the size, and the checksum if given."""
     if sha256 is not None and hashlib.sha256(content).hexdigest() != sha256:
         problem = "is damaged or was changed: its sha256 differs from the one in transforms.json"
         raise InputError(where, problem, "Regenerate it")
     with reading(where, "an image"):
-        image = Image.open(BytesIO(content), formats=FORMATS)
+        image = Image.open(BytesIO(content), formats=formats)
         if image.width * image.height > MAX_PIXELS:
             raise ValueError(f"{image.width}x{image.height} pixels exceed the maximum of {MAX_PIXELS}")
     if image.mode.startswith(("I", "F")):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 
 from neuma_lib.config.capture import CaptureConfig
@@ -17,7 +18,9 @@ PHOTOGRAPHS = "photographs"
 """Group of the photographs. Other groups are named after cameras."""
 PICTURES = (".jpg", ".jpeg", ".png", ".webp")
 VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm")
-OTHER_PICTURES = (".heic", ".heif", ".dng", ".cr2", ".nef", ".arw")
+HEIF = (".heic", ".heif")
+"""Photographs that the package pillow-heif decodes."""
+OTHER_PICTURES = (".dng", ".cr2", ".nef", ".arw")
 """Formats of cameras that are not supported. They cause an error, so that no photograph is silently ignored."""
 
 
@@ -177,12 +180,19 @@ def _listed(folder: Path, name: str) -> list[Path]:
 
 
 def _pictures(folder: Path, name: str) -> tuple[Path, ...]:
+    decoded = HEIF if find_spec("pillow_heif") else ()
     for file in _listed(folder, name):
-        if file.suffix.lower() in OTHER_PICTURES:
+        suffix = file.suffix.lower()
+        if suffix in HEIF and not decoded:
+            problem = "the decoder of HEIC pictures is not installed"
+            raise InputError(
+                file, problem, "Run `pip install pillow-heif`, or convert it to JPEG and remove it"
+            )
+        if suffix in OTHER_PICTURES:
             raise InputError(
                 file, "this picture format is not supported", "Convert it to JPEG, and remove it"
             )
-    return tuple(_by_stem(folder, name, PICTURES).values())
+    return tuple(_by_stem(folder, name, (*PICTURES, *decoded)).values())
 
 
 def _by_stem(folder: Path, name: str, suffixes: Iterable[str]) -> dict[str, Path]:

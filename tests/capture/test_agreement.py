@@ -43,6 +43,15 @@ def test_masks_of_different_objects_have_no_common_place():
         agreement(masks, views, np.tile(K, (2, 1, 1)))
 
 
+def test_an_empty_mask_is_named():
+    """Failed before: the centre of an empty mask is not a number, and its triangulation raised a LinAlgError."""
+    views = ring(4)
+    masks = [ellipsoid_mask(v) for v in views]
+    masks[2] = np.zeros_like(masks[2])
+    with refused("masks", problem="number 2 of 4 is empty"):
+        agreement(masks, views, np.tile(K, (4, 1, 1)))
+
+
 def test_cameras_that_film_different_objects_at_one_place_are_named():
     """The one sees the body, the other a ball of less than half its size where the body would be."""
     views = np.stack([looking((1, 0.5, 0)), looking((0, 0.5, 1))])

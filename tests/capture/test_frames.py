@@ -176,3 +176,45 @@ def test_manifests_read_no_other_file(variable, read, text):
     path.write_text(text.format(other.name))
     with refused(path):
         read(path)
+
+
+def test_repeated_pictures_are_left_out(tmp_path):
+    """Thirty pictures a second in a file of sixty, and single repeats; noise distinguishes pictures of one scene."""
+    rng = np.random.default_rng(0)
+    width, height = SIZE
+
+    def write(path, shown, noise):
+        pictures = 100 + rng.normal(0, noise, (max(shown) + 1, height, width))
+        for k, picture in enumerate(pictures):
+            picture[:, 2 * k : 2 * k + 12] += 80
+        raw = np.clip(pictures, 0, 255).astype(np.uint8)[shown].tobytes()
+        options = ("-f", "rawvideo", "-pix_fmt", "gray", "-s", f"{width}x{height}", "-r", 60, "-i", "-")
+        ffmpeg(*options, "-c:v", "libx264", "-crf", 20, path, content=raw)
+        return frames.read_timeline(path)
+
+    doubled = write(tmp_path / "doubled.mp4", [k // 2 for k in range(40)], 4.0)
+    assert doubled.repeated.tolist() == list(range(1, 40, 2))
+    assert doubled.rate == pytest.approx(30) and doubled.steady and doubled.lost.tolist() == []
+    kept = list(frames.read_frames(tmp_path / "doubled.mp4", doubled))
+    assert [frame.number for frame in kept] == list(range(0, 40, 2))
+    again = frames.timeline_of(doubled.plain())
+    assert again.plain() == doubled.plain()
+    stutter = write(tmp_path / "stutter.mp4", [*range(10), 9, *range(11, 20), 19, 19, *range(22, 30)], 4.0)
+    assert stutter.repeated.tolist() == [10, 20, 21] and stutter.lost.tolist() == [11, 22]
+    assert write(tmp_path / "whole.mp4", list(range(30)), 4.0).repeated.size == 0
+
+
+def test_rest_and_the_highest_point_of_a_flight_are_no_repeated_pictures():
+    """Without noise, pictures at rest are equal. The picture changes by the speed of the object."""
+    rest, speed = np.zeros(10), np.abs(np.arange(-8, 9) + 0.4)
+
+    def repeated(mean, largest):
+        return frames.repeated_frames(np.stack([mean, largest], axis=1)).tolist()
+
+    fall = np.concatenate([rest, speed, rest])
+    assert repeated(fall, fall) == []
+    assert repeated(rest, rest) == []
+    assert repeated(rest[:0], rest[:0]) == []
+    # Compression leaves out the background of frames 2 and 3, and the object moves in them.
+    assert repeated(np.array([5.0, 0.1, 0.1, 5.0]), np.full(4, 90.0)) == []
+    assert repeated(np.array([5.0, 0.1, 0.1, 5.0]), np.array([90.0, 9, 9, 90])) == [2, 3]

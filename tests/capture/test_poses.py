@@ -12,6 +12,7 @@ from neuma_lib.capture.calibration import board as boards
 from neuma_lib.capture.calibration import drawing, placement, poses
 from neuma_lib.capture.calibration import room as rooms
 from neuma_lib.capture.calibration.lens import Lens, read_lens
+from neuma_lib.capture.masks.regions import read_mask
 from neuma_lib.config.capture import CaptureConfig
 from neuma_lib.errors import InputError
 from neuma_lib.io.images import OPENGL_TO_OPENCV, read_transforms
@@ -60,10 +61,39 @@ def test_notes_to_turn_pictures_are_removed(tmp_path):
     assert result["photographs/b.jpg"].read_bytes() == files[1].read_bytes()
 
 
+def test_photographs_that_are_stored_turned_are_turned_back(tmp_path):
+    """Two in the sensor's orientation, one stored upright without a note: its lens is that of the others."""
+    pixels = np.random.default_rng(0).integers(0, 255, (48, 64, 3)).astype(np.uint8)
+    upright = np.rot90(pixels, -1)  # the phone was held upright and turned the picture
+    files = [save(tmp_path / f"{k}.png", p) for k, p in enumerate((pixels, pixels, upright))]
+    named = pics.name_pictures({"photographs": files})
+    assert set(pics.sensor_sizes(named).values()) == {(64, 48)}
+    np.testing.assert_array_equal(pics.read_picture(files[2], (64, 48)), pixels)
+    for copy in pics.copy_pictures(named, tmp_path / "work").values():
+        np.testing.assert_array_equal(pics.read_picture(copy), pixels)
+    assert [pics.orientation_of(file, (64, 48)) for file in files] == [None, None, 6]
+    save(tmp_path / "mask.png", np.where(upright > 127, 255, 0).astype(np.uint8)[..., 0])
+    mask = read_mask(tmp_path / "mask.png", (64, 48))
+    np.testing.assert_array_equal(mask, pixels[..., 0] > 127)
+
+
+def test_heic_photographs_are_converted(tmp_path):
+    heif = pytest.importorskip("pillow_heif")
+    heif.register_heif_opener()
+    pixels = np.full((48, 64, 3), (200, 60, 50), np.uint8)
+    file = save(tmp_path / "a.heic", pixels, quality=95)
+    named = pics.name_pictures({"photographs": [file]})
+    assert list(named) == ["photographs/a.png"] and pics.picture_size(file) == (64, 48)
+    (copy,) = pics.copy_pictures(named, tmp_path / "work").values()
+    with Image.open(copy) as image:
+        assert image.format == "PNG"
+        np.testing.assert_allclose(np.asarray(image.convert("RGB")).astype(int), pixels, atol=6)
+
+
 def test_pictures_of_other_sizes_or_none_are_refused(tmp_path):
     a = save(tmp_path / "a.png", np.zeros((48, 64, 3), np.uint8))
-    b = save(tmp_path / "b.png", np.zeros((64, 48, 3), np.uint8))
-    with pytest.raises(InputError, match="b.png: 48x64 .*a.png has 64x48"):
+    b = save(tmp_path / "b.png", np.zeros((64, 40, 3), np.uint8))
+    with pytest.raises(InputError, match="b.png: 40x64 .*a.png has 64x48"):
         pics.name_pictures({"photographs": [a, b]})
     text = tmp_path / "c.png"
     text.write_text("no picture")
@@ -84,6 +114,8 @@ def test_what_found_no_place_is_named():
     with pytest.raises(InputError, match=r"7 of 17 .* \(not 10.png, .* and 5 more\)"):
         poses.check_registered(poses.replace(whole, lost=lost))
     poses.check_registered(poses.replace(whole, lost=lost[:3]))
+    with refused("photographs", problem="they show two scenes without common points"):
+        poses.check_registered(poses.replace(whole, lost=lost), [set(whole.names), set(lost)])
     with refused("left/left.png"):
         poses.check_registered(poses.replace(whole, lost=("left/left.png",)))
 

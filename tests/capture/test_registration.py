@@ -9,7 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from neuma_lib.capture.registration.problem import FittedPose, Problem
-from neuma_lib.capture.registration.registration import first_common, register
+from neuma_lib.capture.registration.registration import check_overlap, first_common, register
 from neuma_lib.capture.registration.rigid_motion import RigidMotion, angle_between, rotate, spread_rotations
 from neuma_lib.capture.registration.rigid_views import Body, Pictures
 from neuma_lib.coupling.initial_motion import InitialMotion
@@ -181,7 +181,7 @@ def test_another_object_is_refused():
     other = ellipsoid_body(count=250, radii=(0.14, 0.02, 0.02), bump=0.0, seed=3)
     sights = filmed(other, true_motion(other, Rotation.random(random_state=5).as_matrix()), frames=3)
     with refused("one"):
-        register(body.gaussians, body.particles, body.mass, sights, guess(), "one")
+        check_overlap(register(body.gaussians, body.particles, body.mass, sights, guess(), "one"), "one")
 
 
 def test_flights_that_no_camera_shares_are_refused():

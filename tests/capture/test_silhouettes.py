@@ -68,9 +68,9 @@ def test_colours_are_learned_from_the_object_and_not_from_its_shadow():
         0, 2, background.shape
     )
     frame = np.clip(np.rint(frame), 0, 255).astype(np.uint8)
-    palette = silhouettes.learn_palette([frame], [background], [body | dark])
+    palette = silhouettes.learn_palette([(frame, background, body | dark)])
     red = palette.colours[:, 0] > 2 * palette.colours[:, 1]
     assert palette.shares[red].sum() > 0.95 and palette.shares.sum() == pytest.approx(1)
-    assert silhouettes.learn_palette([frame], [background], [np.zeros(body.shape, bool)]) is None
+    assert silhouettes.learn_palette([(frame, background, np.zeros(body.shape, bool))]) is None
     result = silhouettes.silhouette(frame, background, body | dark, palette)
     assert (result & body).sum() / (result | body).sum() > 0.97

@@ -45,6 +45,12 @@ def test_the_nearest_targets_are_named(target, near):
         refuse_unknown([target], RULES, NAMES)
 
 
+@pytest.mark.parametrize("name", ["my mug", "Plüschtier"])
+def test_a_folder_name_that_no_result_can_have_is_the_cause(name):
+    with refused(name, problem=f"'{name}' cannot name a folder", remedy="Rename the capture's folder"):
+        refuse_unknown([f"results/{name}/capture.md"], RULES, NAMES)
+
+
 def test_rules_their_files_and_existing_files_are_targets(tmp_path):
     refuse_unknown(
         ["all", "results/table1.csv", "results/ClayCat/neuma/metrics.json", tmp_path], RULES, NAMES

@@ -49,10 +49,10 @@ rule capture_video_masks:
     conda:
         CAPTURE_ENVIRONMENT
     resources:
-        mem_mb=8000,
+        mem_mb=2000,
     params:
         camera="{camera}",
-        rate=VIDEO_RATE,
+        duration=capture_setting("duration"),
         longest=capture_setting("longest"),
         name="{capture}, {take}, {camera}",
     script:
@@ -65,6 +65,7 @@ rule capture_flight:
         transforms=of_take_cameras(MATTES),
         reports=of_take_cameras(f"{VIDEO_MASKS}.json"),
         timelines=of_take_cameras(f"{VIDEO_FRAMES}.json"),
+        room=f"{RESULTS}/{{capture}}/room.json",
     output:
         flight=f"{FLIGHT}.json",
         picture=f"{FLIGHT}.png",

@@ -4,12 +4,14 @@ from pathlib import Path
 
 import numpy as np
 
+from neuma_lib.capture.calibration.vertical import read_cues
 from neuma_lib.capture.masks.agreement import check_one_object
-from neuma_lib.capture.masks.mattes import metric_camera
-from neuma_lib.capture.motion.flight import Filmed, draw_flight, find_flight, report
+from neuma_lib.capture.masks.mattes import Mattes, metric_camera
+from neuma_lib.capture.motion.flight import Filmed, draw_flight, draw_tracks, find_flight, report
 from neuma_lib.capture.motion.timing import read_sound
+from neuma_lib.capture.pictures import evidence
 from neuma_lib.io.files import listed, read_json, write_json
-from neuma_lib.io.images import read_image_set, read_transforms
+from neuma_lib.io.images import read_transforms
 from workflow.stage import run_script
 
 
@@ -26,9 +28,12 @@ def main(inputs, output, params, run) -> None:
         strict=True,
     )
     views = [filmed(*values) for values in files]
-    flight = find_flight(views, params.name, params.metric)
-    if params.metric and flight.agreement is not None:
-        check_one_object(flight.agreement, params.cameras, params.name)
+    room = inputs.get("room")
+    with evidence(output.picture, lambda path: draw_tracks(path, views, params.name)):
+        cues = read_cues(read_json(room)["up"]) if room else ()
+        flight = find_flight(views, params.name, params.metric, cues)
+        if params.metric and flight.agreement is not None:
+            check_one_object(flight.agreement, params.cameras, params.name)
     draw_flight(output.picture, flight, views, flight.gravity)
     write_json(output.flight, report(flight, views))
     for line in [*flight.offsets_from, flight.gravity]:
@@ -39,16 +44,15 @@ def main(inputs, output, params, run) -> None:
 
 
 def filmed(camera, video, transforms, masks, timeline, offset, row_time) -> Filmed:
-    data, timeline = read_transforms(transforms), read_json(timeline)
-    images = read_image_set(transforms).images
+    data, timeline, mattes = read_transforms(transforms), read_json(timeline), Mattes(transforms)
     flights = read_json(masks)["arcs"]
     viewmat, K = metric_camera(data["frames"][0], data.get("world", {}))
     return Filmed(
         camera,
         np.array([frame["step"] for frame in data["frames"]]),
         np.array([frame["time"] for frame in data["frames"]]),
-        images[..., :3],
-        images[..., 3] > 127,
+        mattes,
+        np.stack([matte[..., 3] > 127 for matte in mattes]),
         tuple(flights[0]) if flights else None,
         viewmat,
         K,

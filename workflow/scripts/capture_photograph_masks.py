@@ -7,6 +7,7 @@ import numpy as np
 from neuma_lib.capture.calibration.board import board_outline
 from neuma_lib.capture.calibration.lens import read_lens
 from neuma_lib.capture.frames import Frame
+from neuma_lib.capture.gates import check_masks
 from neuma_lib.capture.masks.agreement import MIN_AGREEMENT, agreement
 from neuma_lib.capture.masks.mask_refinement import refined_masks
 from neuma_lib.capture.masks.mattes import (
@@ -19,7 +20,7 @@ from neuma_lib.capture.masks.mattes import (
 from neuma_lib.capture.masks.photograph_masks import photograph_mask
 from neuma_lib.capture.masks.regions import overlay
 from neuma_lib.capture.masks.saliency import Saliency
-from neuma_lib.capture.pictures import picture_sheet, read_picture
+from neuma_lib.capture.pictures import evidence, picture_sheet, read_picture
 from neuma_lib.config.board import BoardConfig
 from neuma_lib.errors import InputError
 from neuma_lib.io.files import listed, read_json, write_json
@@ -52,15 +53,29 @@ def main(inputs, output, params, run) -> None:
     cameras, Ks = map(np.stack, zip(*(metric_camera(frame, {}) for frame in frames)))
     is_own = [name in own for name in names]  # masks of the user are not refined
     ious = np.ones(1)
+
+    def draw(path: Path) -> None:
+        sheet = [
+            (f"{name}: {value:.2f}", overlay(Frame(0, 0.0, pixels), mask).pixels)
+            for name, value, pixels, mask in zip(names, ious, pictures, masks)
+        ]
+        picture_sheet(path, sheet, f"{params.name}: IoU of the masks with their visual hull", 6)
+
     if len(masks) > 1:
-        _check(agreement(masks, cameras, Ks), names, is_own, params.name)
+        with evidence(output.sheet, draw):
+            ious = np.zeros(len(masks))  # if there is no common body
+            ious = agreement(masks, cameras, Ks)
+            unrefined = [k for k, own_one in enumerate(is_own) if not own_one]
+            if unrefined:
+                check_masks(ious[unrefined], params.name)
 
         def progress(done: int, total: int) -> None:
             run.progress(total + (_STEPS - 1) * done, _STEPS * total)
 
         masks = refined_masks(pictures, masks, cameras, Ks, is_own, progress)
         ious = agreement(masks, cameras, Ks)
-    doubtful = _check(ious, names, is_own, params.name)
+    with evidence(output.sheet, draw):
+        doubtful = _check(ious, names, is_own, params.name)
     kept = [name not in doubtful for name in names]
     sheet = [
         (f"{name}: {value:.2f}{'' if good else ', left out'}", overlay(Frame(0, 0.0, pixels), mask).pixels)

@@ -5,15 +5,16 @@ import shutil
 import numpy as np
 import torch
 
+from neuma_lib.capture.masks.mattes import Mattes, metric_camera
 from neuma_lib.capture.motion.gravity import GRAVITY, Gravity
 from neuma_lib.capture.motion.synchronisation import frame_times
-from neuma_lib.capture.pictures import picture_sheet
-from neuma_lib.capture.registration.registration import Parabola, register
+from neuma_lib.capture.pictures import evidence, picture_sheet
+from neuma_lib.capture.registration.registration import Parabola, check_overlap, register
 from neuma_lib.capture.registration.rigid_views import Sight
 from neuma_lib.errors import InputError
 from neuma_lib.io.files import atomic, listed, read_json, write_json
 from neuma_lib.io.gaussians import load_gaussians, save_gaussians
-from neuma_lib.io.images import read_image_set, read_transforms
+from neuma_lib.io.images import read_transforms
 from neuma_lib.io.particles import load_particles, save_particles
 from neuma_lib.io.ply import read_ply, write_ply
 from neuma_lib.splatting.rigid import moved
@@ -54,7 +55,13 @@ def main(inputs, output, params, run) -> None:
         f"the placed object in {registered.pictures[0]} pictures",
         len(sights) > 1,
     )
-    line = gravity.check(params.name) if scale_known else gravity.describe(params.name)
+
+    def draw(path) -> None:
+        draw_comparisons(path, registered, params.name)
+
+    with evidence(output.picture, draw):
+        check_overlap(registered, params.name)
+        line = gravity.check(params.name) if scale_known else gravity.describe(params.name)
     placed = registered.place(x.double().numpy())
     if placed.min() < 0 or placed.max() > 1:
         raise InputError(
@@ -76,17 +83,7 @@ def main(inputs, output, params, run) -> None:
         save_particles(target, placed.to(x), registered.scale**3 * vol0, attributes)
     with atomic(output.binding) as partial:
         shutil.copyfile(inputs.binding, partial)
-    pictures = []
-    for compared in registered.comparisons:
-        triple = [compared.seen, compared.rendered, (1 + compared.rendered - compared.seen) / 2]
-        pixels = np.rint(255 * np.concatenate(triple, axis=1)).astype(np.uint8)
-        pictures.append(
-            (
-                f"{registered.names[compared.camera]}, {compared.time:.4f} s: seen, rendered, difference",
-                pixels,
-            )
-        )
-    picture_sheet(output.picture, pictures, f"{params.name}: {registered.summary()}", columns=3)
+    draw(output.picture)
     write_json(output.velocity, registered.velocity())
     write_json(output.registration, {**registered.report(), **gravity.report(), "gravity": line})
     run.log(registered.summary())
@@ -95,20 +92,31 @@ def main(inputs, output, params, run) -> None:
         run.log(f"undetermined: {registered.ambiguous}")
 
 
+def draw_comparisons(path, registered, name) -> None:
+    pictures = []
+    for compared in registered.comparisons:
+        triple = [compared.seen, compared.rendered, (1 + compared.rendered - compared.seen) / 2]
+        pixels = np.rint(255 * np.concatenate(triple, axis=1).clip(0, 1)).astype(np.uint8)
+        camera = registered.names[compared.camera]
+        pictures.append((f"{camera}, {compared.time:.4f} s: seen, rendered, difference", pixels))
+    picture_sheet(path, pictures, f"{name}: {registered.summary()}", columns=3)
+
+
 def sight(camera, transforms, timeline, row_time, flight, name) -> Sight:
     """Frames of one camera during free flight."""
-    data, images = read_transforms(transforms), read_image_set(transforms)
+    mattes = Mattes(transforms)
     first, last = flight["frames"][camera]
-    flying = [k for k, step in enumerate(images.steps) if first <= step <= last]
+    flying = [k for k, frame in enumerate(mattes.frames) if first <= frame["step"] <= last]
     if not flying:
         raise InputError(
             f"{name}, {camera}", f"{transforms} has none of the frames {first} to {last} of the flight"
         )
-    frames, pixels = [data["frames"][k] for k in flying], images.images[flying]
+    frames, pixels = [mattes.frames[k] for k in flying], np.stack([mattes[k] for k in flying])
     rows = np.array([np.flatnonzero(image[..., 3].any(axis=1)).mean() + 0.5 for image in pixels])
     times = frame_times(frames, rows, row_time, read_json(timeline)["height"])
     known = flight["offsets_deviation_s"][camera] == 0
-    return Sight(camera, times, pixels, images.viewmats[0], images.Ks[0], flight["offsets_s"][camera], known)
+    viewmat, K = metric_camera(frames[0], {})
+    return Sight(camera, times, pixels, viewmat, K, flight["offsets_s"][camera], known)
 
 
 def parabola(flight, scale, offset, metric) -> Parabola:

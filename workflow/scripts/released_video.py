@@ -30,7 +30,8 @@ def main(inputs, output, params, run) -> None:
     jump = float(area_jumps(np.array(areas[: len(flying)])).max()) if len(flying) > 1 else None
     report = {"frames": len(shots), "shown": numbers, "arcs": [[flying[0], flying[-1]]], "areas": areas}
     write_json(output.report, {**report, "largest_jump": jump, "moving": 0.0, "own": len(shots)})
-    timeline = {"frames": len(shots), "rate": RATE, "steady": True, "lost_before": [], "stretch": 1.0}
+    timeline = {"frames": len(shots), "rate": RATE, "steady": True, "stretch": 1.0}
+    timeline |= {"lost_before": [], "repeated": []}
     size = {"width": shots[0].lens.width, "height": shots[0].lens.height}
     times = [frame["time"] for frame in frames]
     write_json(output.timeline, {**timeline, **size, "times_s": np.asarray(times).tolist()})

@@ -8,6 +8,7 @@ pixels are shifted by half a pixel where they are passed to OpenCV. Cameras look
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -83,12 +84,16 @@ class Lens:
         if not self.distortion.any():
             return image
         cv2 = opencv()
-        target = self.pinhole()._opencv_K()
-        size = (self.width, self.height)
-        maps = cv2.initUndistortRectifyMap(
+        return cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+    @cached_property
+    def _maps(self) -> tuple[np.ndarray, np.ndarray]:
+        """Maps of `undistort`, computed once for all frames of a video."""
+        target, size = self.pinhole()._opencv_K(), (self.width, self.height)
+        cv2 = opencv()
+        return cv2.initUndistortRectifyMap(
             self._opencv_K(), self.distortion, None, target, size, cv2.CV_32FC1
         )
-        return cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
     def resized(self, longest: int) -> Lens:
         """The lens for pictures reduced to a longer side of at most ``longest`` pixels."""

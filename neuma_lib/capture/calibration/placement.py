@@ -112,7 +112,12 @@ def triangulate(
 
 
 def fit_floor(
-    points: np.ndarray, cameras: np.ndarray, tolerance: float, seed: int
+    points: np.ndarray,
+    cameras: np.ndarray,
+    tolerance: float,
+    seed: int,
+    up: np.ndarray | None = None,
+    max_angle: float = 180.0,
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """RANSAC fit of the plane with the most points near it that has all cameras on one side.
 
@@ -121,6 +126,8 @@ def fit_floor(
         cameras: centres of the cameras, (M, 3).
         tolerance: distance from the plane of near points.
         seed: of the random samples.
+        up: upward direction, unit vector (3,). None: unknown.
+        max_angle: of the normal from ``up`` [degrees]. It excludes walls, which often have more points.
 
     Returns:
         A point of the plane (3,), its unit normal (3,) towards the cameras, and the share of near points.
@@ -138,15 +145,20 @@ def fit_floor(
             continue
         normal /= size
         sides = (cameras - a) @ normal
+        if not (np.sign(sides) == np.sign(sides[0])).all():
+            continue
+        if up is not None and np.sign(sides[0]) * (normal @ up) < np.cos(np.radians(max_angle)):
+            continue
         inliers = np.abs((points - a) @ normal) < tolerance
-        if (np.sign(sides) == np.sign(sides[0])).all() and inliers.sum() > best:
+        if inliers.sum() > best:
             best, near = int(inliers.sum()), inliers
     if near is None or best < max(10, 0.1 * len(points)):
+        level = "" if up is None else f" within {max_angle:.0f} degrees of the level of the cameras"
         raise InputError(
             "photographs",
-            f"no floor detected: the best plane has {best} of {len(points)} points, a tenth and at least 10 are"
-            " required",
-            "Lay down the printed board, or photograph a floor with texture",
+            f"no floor detected: the best plane{level} has {best} of {len(points)} points, a tenth and at least 10"
+            " are required",
+            "Lay down the printed board, or photograph more of a floor with texture",
         )
     for _ in range(3):  # least squares and selection of near points in turn
         middle = points[near].mean(axis=0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,14 @@ from neuma_lib.capture.calibration.board import Detection, board_pose, find_boar
 from neuma_lib.capture.calibration.lens import Lens, lens_of_colmap, read_lens
 from neuma_lib.capture.calibration.placement import Similarity
 from neuma_lib.capture.calibration.resection import MIN_POINTS, Sighting, resect, triangulated
-from neuma_lib.capture.pictures import copy_pictures, group_of, name_pictures, picture_size, read_picture
+from neuma_lib.capture.pictures import (
+    copy_pictures,
+    group_of,
+    name_pictures,
+    picture_size,
+    read_picture,
+    sensor_sizes,
+)
 from neuma_lib.capture.tools import colmap
 from neuma_lib.config.capture import BoardConfig
 from neuma_lib.errors import InputError
@@ -28,6 +35,7 @@ _MIN_PHOTOGRAPHS = 8  # photographs required for structure from motion
 FEW_PHOTOGRAPHS = 20
 """Number below which thresholds are lower (`_mapping_options`) and the lens is not refined (`_refine_lens`)."""
 _MIN_REGISTERED = 0.7  # share of the photographs that must be registered
+_MIN_GROUP = 3  # photographs of another scene
 _LARGEST = 2400  # longer side of pictures for feature extraction [px]
 PHOTOGRAPH_MODEL, STILL_MODEL = "RADIAL", "SIMPLE_RADIAL"
 """COLMAP's camera models during mapping, with square pixels and a centred lens: with ten photographs, a second focal
@@ -96,7 +104,7 @@ def find_poses(
     for name, file in pictures.items():
         if (lens := known.get(group_of(name))) is not None:
             size = picture_size(file)
-            if size != (lens.width, lens.height):
+            if sorted(size) != sorted((lens.width, lens.height)):
                 raise InputError(
                     f"{lenses}: {group_of(name)}",
                     f"the lens has {lens.width}x{lens.height} pixels, {file} has {size[0]}x{size[1]}",
@@ -112,7 +120,8 @@ def find_poses(
 
 def find_boards(pictures: Mapping[str, Path], board: BoardConfig) -> dict[str, Detection]:
     """Corners of the board in every picture, by name."""
-    return {name: find_board(read_picture(file), board) for name, file in pictures.items()}
+    sizes = sensor_sizes(pictures)
+    return {name: find_board(read_picture(file, sizes[name]), board) for name, file in pictures.items()}
 
 
 def save_poses(path: str | Path, points: str | Path, poses: Poses) -> None:
@@ -246,7 +255,8 @@ def structure_from_motion(
     poses = _poses_of(best, pictures, lenses)
     if placed >= FEW_PHOTOGRAPHS:
         poses = _resect_stills(poses, best, lenses)
-    check_registered(poses)
+    groups = [{model.images[k].name for k in model.reg_image_ids()} for model in models.values()]
+    check_registered(poses, groups)
     return poses
 
 
@@ -333,10 +343,24 @@ def plausible(lens: Lens) -> bool:
     return bool(off_centre < MAX_OFF_CENTRE * max(lens.width, lens.height) and stretch < _MAX_STRETCH)
 
 
-def check_registered(poses: Poses) -> None:
-    """Raises InputError unless enough photographs and all fixed cameras are registered."""
+def check_registered(poses: Poses, groups: Sequence[Collection[str]] = ()) -> None:
+    """Raises InputError unless enough photographs and all fixed cameras are registered.
+
+    Args:
+        groups: names of the pictures of each reconstruction. Several mean that the pictures show different scenes.
+    """
     lost = [name for name in poses.lost if group_of(name) == PHOTOGRAPHS]
     placed = sum(group_of(name) == PHOTOGRAPHS for name in poses.names)
+    other = max((sorted(set(lost) & set(group)) for group in groups), key=len, default=[])
+    if placed < _MIN_REGISTERED * (placed + len(lost)) and len(other) >= _MIN_GROUP:
+        own = [name for name in poses.names if group_of(name) == PHOTOGRAPHS]
+        raise InputError(
+            PHOTOGRAPHS,
+            f"they show two scenes without common points: {len(own)} as {_some(own, 3)}, and {len(other)} as"
+            f" {_some(other, 3)}",
+            "Put the photographs of another object into another capture. If the object was moved in between, use one"
+            " group alone, with more photographs. If it is one scene, add photographs between the two groups",
+        )
     if placed < _MIN_REGISTERED * (placed + len(lost)):
         raise InputError(
             PHOTOGRAPHS,

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,16 @@ from neuma_lib.capture.calibration.placement import (
     upright,
 )
 from neuma_lib.capture.calibration.poses import Poses, find_boards
-from neuma_lib.capture.pictures import group_of, read_picture, undistorted, write_png
+from neuma_lib.capture.calibration.vertical import MAX_ANGLE, UP, Cue, camera_cues, check_vertical
+from neuma_lib.capture.pictures import (
+    group_of,
+    orientation_of,
+    picture_name,
+    picture_size,
+    read_picture,
+    undistorted,
+    write_png,
+)
 from neuma_lib.config.capture import CaptureConfig, LengthConfig
 from neuma_lib.errors import InputError
 from neuma_lib.io.images import OPENGL_TO_OPENCV, transform_world, write_transforms
@@ -39,29 +48,56 @@ class Room:
         room_from_world: from the world of the estimated poses.
         board: fit of the board. None without one.
         floor: share of the points near the fitted floor. None with a board.
+        cues: upward directions in the room, the one that defines the room's y first.
     """
 
     poses: Poses
     room_from_world: Similarity
     board: BoardFit | None = None
     floor: float | None = None
+    cues: tuple[Cue, ...] = ()
 
 
 def find_room(poses: Poses, pictures: Mapping[str, Path], settings: CaptureConfig) -> Room:
-    """The room of poses by the method in the settings, from pictures by name. Raises InputError as `room_of`."""
+    """The room of poses by the method in the settings, from pictures by name.
+
+    Raises:
+        InputError: as `room_of`, or its upward direction contradicts the photographs (`check_vertical`).
+    """
+    held = [i for i, name in enumerate(poses.names) if group_of(name) == PHOTOGRAPHS]
+    sizes = [(poses.lenses[i].width, poses.lenses[i].height) for i in held]
+    orientations = [orientation_of(pictures[poses.names[i]], size) for i, size in zip(held, sizes)]
+    cues = camera_cues(poses.viewmats[held], orientations)
     if settings.poses == "photographs":
         placed = {name: pictures[name] for name in poses.names}
-        return room_of(poses, find_boards(placed, settings.board) if settings.board else {}, settings)
-    room = room_from_board(settings.board, settings.center) if settings.poses == "board" else Similarity()
-    return Room(poses.moved(room), room)
+        for file in settings.length.ends if settings.length else ():
+            name = picture_name(PHOTOGRAPHS, file)
+            size = sizes[held.index(poses.names.index(name))] if name in poses.names else None
+            if size and picture_size(pictures[name]) != size:
+                problem = "the photograph is stored turned, so its pixels are not those of the sensor"
+                raise InputError(f"length.ends.{file}", problem, "Mark the points in other photographs")
+        boards = find_boards(placed, settings.board) if settings.board else {}
+        room = room_of(poses, boards, settings, cues)
+    else:
+        on_board = settings.poses == "board"
+        level = room_from_board(settings.board, settings.center) if on_board else Similarity()
+        room = Room(poses.moved(level), level)
+    source = "board" if settings.board else "floor" if room.floor is not None else "given poses"
+    turned = (replace(cue, up=room.room_from_world.rotation @ cue.up) for cue in cues)
+    room = replace(room, cues=(Cue(source, np.array(UP)), *turned))
+    check_vertical(room.cues, PHOTOGRAPHS)
+    return room
 
 
-def room_of(poses: Poses, detections: Mapping[str, Detection], settings: CaptureConfig) -> Room:
+def room_of(
+    poses: Poses, detections: Mapping[str, Detection], settings: CaptureConfig, cues: Sequence[Cue] = ()
+) -> Room:
     """Make poses metric and upright, by the board, else by a known length and a fitted floor.
 
     Args:
         poses: of structure from motion.
         detections: corners of the board by picture, unused without a board.
+        cues: upward directions in the world of the poses. The first one excludes walls from the search of the floor.
 
     Raises:
         InputError: see `fit_board`, `scale_from_length`, `fit_floor`.
@@ -75,7 +111,8 @@ def room_of(poses: Poses, detections: Mapping[str, Detection], settings: Capture
     away = (
         np.median(np.linalg.norm(poses.points - centres.mean(axis=0), axis=1)) if len(poses.points) else 0.0
     )
-    point, normal, share = fit_floor(poses.points, centres, FLOOR_TOLERANCE * away, settings.seed)
+    level = [cues[0].up, MAX_ANGLE + 2 * cues[0].deviation] if cues else []
+    point, normal, share = fit_floor(poses.points, centres, FLOOR_TOLERANCE * away, settings.seed, *level)
     middle = np.median(poses.points, axis=0)
     level = upright(normal, middle - ((middle - point) @ normal) * normal)
     scale = _metres_per_unit(poses, settings.length)
@@ -86,7 +123,7 @@ def room_of(poses: Poses, detections: Mapping[str, Detection], settings: Capture
 def _metres_per_unit(poses: Poses, length: LengthConfig) -> float:
     views, directions = [], []
     for file, ends in length.ends.items():
-        name = f"{PHOTOGRAPHS}/{file}"
+        name = picture_name(PHOTOGRAPHS, file)
         if name in poses.names:
             i = poses.names.index(name)
             views.append(poses.viewmats[i])
@@ -118,7 +155,7 @@ def write_room(
     photographs = 0
     for name, lens, viewmat in zip(room.poses.names, room.poses.lenses, room.poses.viewmats):
         smaller = lens.pinhole().resized(settings.longest)
-        pixels = undistorted(read_picture(pictures[name]), lens, settings.longest)
+        pixels = undistorted(read_picture(pictures[name], (lens.width, lens.height)), lens, settings.longest)
         file = folder / Path(name).with_suffix(".png")
         write_png(file, pixels)
         group = group_of(name)
@@ -154,5 +191,6 @@ def report(room: Room) -> dict[str, Any]:
         "unsure": {name: list(values) for name, values in poses.unsure.items()},
         "board": room.board.plain() if room.board else None,
         "share_of_points_on_floor": room.floor,
+        "up": [cue.plain() for cue in room.cues],
         "centres_m": dict(zip(poses.names, camera_centres(poses.viewmats).tolist())),
     }

@@ -72,8 +72,14 @@ def common_body(masks: Sequence[np.ndarray], viewmats: np.ndarray, Ks: np.ndarra
         Ks: [px], pixel centres at +0.5, (N, 3, 3).
 
     Raises:
-        InputError: no point in space lies in most of the masks.
+        InputError: a mask is empty, or no point in space lies in most of them.
     """
+    if empty := [str(k) for k, mask in enumerate(masks) if not mask.any()]:
+        raise InputError(
+            "masks",
+            f"number {', '.join(empty)} of {len(masks)} is empty",
+            "Leave out its picture, or provide a mask",
+        )
     middle, radii = middle_and_radii(masks, viewmats, Ks)
     if not (radii > 0).any():
         raise InputError(*_NO_COMMON_VOLUME)

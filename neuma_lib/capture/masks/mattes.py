@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ from neuma_lib.capture.calibration.lens import Lens
 from neuma_lib.capture.masks.regions import matted, read_mask
 from neuma_lib.capture.pictures import undistorted, write_png
 from neuma_lib.errors import InputError
-from neuma_lib.io.images import OPENGL_TO_OPENCV, read_transforms, write_transforms
+from neuma_lib.io.images import OPENGL_TO_OPENCV, image_file, read_rgba, read_transforms, write_transforms
 
 
 def room_frames(path: str | Path, group: str) -> list[dict[str, Any]]:
@@ -50,6 +50,22 @@ def world_of(room: str | Path) -> dict[str, Any]:
     """Entries of the room's transforms.json that describe its world, shared by all files derived from it."""
     data = read_transforms(room)
     return {key: data[key] for key in ("world", "room") if key in data}
+
+
+class Mattes(Sequence[np.ndarray]):
+    """Mattes of a transforms.json, straight-alpha RGBA (H, W, 4), uint8, each read when it is used."""
+
+    def __init__(self, path: str | Path):
+        self._path, self.frames = path, read_transforms(path)["frames"]
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __getitem__(self, i: int) -> np.ndarray:
+        frame = self.frames[i]
+        file = image_file(Path(self._path).parent, frame["file_path"], self._path)
+        size = (frame["w"], frame["h"]) if "w" in frame else None
+        return read_rgba(file, frame.get("sha256"), size)
 
 
 def write_mattes(

@@ -92,13 +92,22 @@ def read_mask(path: str | Path, size: tuple[int, int]) -> np.ndarray:
         image.load()
         has_alpha = "A" in image.mode or "transparency" in image.info
         mask = np.asarray(image.convert("RGBA").getchannel("A") if has_alpha else image.convert("L")) > 127
+    if (
+        mask.shape == tuple(size) != mask.shape[::-1]
+    ):  # of a picture that is stored turned, see `read_picture`
+        mask = np.rot90(mask)
     if mask.shape[::-1] != tuple(size):
         raise InputError(
             path,
             f"the mask is {mask.shape[1]}x{mask.shape[0]}, its picture {size[0]}x{size[1]}",
             "Save the mask at the size of its picture",
         )
-    check_not_empty(mask, path)
+    if not mask.any():
+        raise InputError(
+            path,
+            "the mask is empty, it has no white or opaque pixel",
+            "Draw the object in white, or delete the file if its picture does not show the object",
+        )
     return mask
 
 

@@ -15,7 +15,7 @@ Shading and mixing are computed in linear light, noise in sRGB levels.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,21 +75,18 @@ class _BackgroundFit:
         return np.minimum(self.lit, self.shaded)
 
 
-def learn_palette(
-    frames: Sequence[np.ndarray], backgrounds: Sequence[np.ndarray], masks: Sequence[np.ndarray]
-) -> Palette | None:
+def learn_palette(views: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Palette | None:
     """Learn the colours of the object from frames in which no shadow touches it. None if there are too few pixels.
 
     Pixels that the background also explains are left out, so that shadows in a mask do not become object colours.
 
     Args:
-        frames: RGB, uint8, (H, W, 3).
-        backgrounds: the empty scene at the exposure of each frame, float32, (H, W, 3).
-        masks: initial masks, Boolean, (H, W).
+        views: frames, RGB, uint8, (H, W, 3); the empty scene at the exposure of each, float32, (H, W, 3); and initial
+            masks, Boolean, (H, W).
     """
     cv2 = opencv()
     seen = [np.empty((0, 3), np.float32)]
-    for frame, background, mask in zip(frames, backgrounds, masks):
+    for frame, background, mask in views:
         if mask.any():
             box = box_of(mask, _WINDOW)
             picture = frame[box].astype(np.float32)

@@ -6,12 +6,15 @@ all channels by one factor. Of the rest, the component at the expected position 
 Dark, tinted shadows near the floor remain in this mask. They are removed with the colours of the object, learned in
 free flight (`silhouettes`).
 
+A long video is first read once at reduced size to find the flight (`find_flight_window`). Only the frames near it are
+masked. Pictures may lie in a file (`neuma_lib.capture.frames.StoredPictures`): one at a time is in memory.
+
 Pictures are RGB, uint8, (H, W, 3). Masks are Boolean, (H, W). Positions are (x, y) [px], pixel centres at +0.5.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -24,6 +27,7 @@ from neuma_lib.capture.masks.background import (
     match_exposure,
     median_background,
 )
+from neuma_lib.capture.masks.continuity import Break, appearance, broken_frames, grouped
 from neuma_lib.capture.masks.regions import (
     box_of,
     centroid,
@@ -48,6 +52,9 @@ _SURE = 30.0  # difference from the background that is certainly an object [leve
 _POSSIBLE = 12.0  # difference that may be an object in a picture without noise [levels of 255]
 _MAX_NOISE = 6.0  # maximum standard deviation of a camera's noise [levels]; larger differences are motion
 _ROUNDS = 2  # iterations of learning colours and drawing silhouettes
+MAX_FRAMES = 300
+"""Number of frames of a video that are masked. More are thinned out."""
+_BEFORE = 0.1  # time before the flight that is masked as well [s]
 _LOST = 2  # frames after which a lost object is no longer searched for
 
 
@@ -59,11 +66,13 @@ class VideoMasks:
         masks: (T, H, W), Boolean, all False where the object is not visible.
         moving: share of the picture outside object and shadows that differs from the background, (T,).
         tracks: segments of free flight, in order of time.
+        breaks: frames that were left out since their masks do not continue the track.
     """
 
     masks: np.ndarray
     moving: np.ndarray
     tracks: tuple[BallisticTrack, ...]
+    breaks: tuple[Break, ...] = ()
 
     @property
     def areas(self) -> np.ndarray:
@@ -107,7 +116,7 @@ def video_masks(
             f" {frames[0].shape[1]}x{frames[0].shape[0]}",
             "Use a frame of the same camera in the same mode as the empty picture",
         )
-    changes = [_Change(frame, background) for frame in frames]
+    changes = [_Change(frames, i, background) for i in range(len(frames))]
     times = np.arange(len(frames), dtype=float) if times is None else np.asarray(times, float)
     tracks = find_ballistic_tracks([change.parts[~change.cut] for change in changes], times, down)
     drafts = _Drafts(changes)
@@ -117,12 +126,50 @@ def video_masks(
     begin = tracks[0].frames[0] if tracks else 0
     for order in (range(begin, len(frames)), range(begin - 1, -1, -1)):
         drafts.extrapolate(order)
-    masks = _silhouettes(changes, drafts.masks, tracks)
-    moving = np.array([(c.strong & ~grown(m, 5)).mean() for c, m in zip(changes, drafts.masks)])
+    masks = drafts.masks
+    moving = np.array([(c.strong & ~grown(m, 5)).mean() for c, m in zip(changes, masks)])
+    _draw_silhouettes(changes, masks, tracks)
     # A hand that holds the object before its flight is allowed.
     check_background(np.where(np.arange(len(frames)) < begin, 0, moving), name)
+    masks[masks.sum(axis=(1, 2)) < min_area(masks[0])] = False
+    breaks = []
+    if tracks and places is None:
+        seen = [appearance(change.frame, mask) for change, mask in zip(changes, masks)]
+        broken = broken_frames(seen, times, tracks[0].frames)
+        masks[[i for i, _ in broken]] = False
+        breaks = grouped(broken)
     check_not_empty(masks, name)
-    return VideoMasks(masks, moving, tuple(tracks))
+    return VideoMasks(masks, moving, tuple(tracks), tuple(breaks))
+
+
+def find_flight_window(
+    pictures: Iterable[np.ndarray],
+    background: np.ndarray,
+    times: np.ndarray,
+    duration: float,
+    down: np.ndarray | None = None,
+) -> np.ndarray:
+    """Indices of the frames from shortly before the first free flight on, at most `MAX_FRAMES`.
+
+    Only the list of moving regions of each frame stays in memory. Without a flight, the window begins with the first
+    motion.
+
+    Args:
+        pictures: of T frames, possibly at reduced size.
+        background: the empty scene at that size.
+        times: of the frames [s], ascending, (T,).
+        duration: from the start of the flight [s].
+        down: see `find_ballistic_tracks`.
+    """
+    parts = []
+    for picture in pictures:
+        change = _Change([picture], 0, background)
+        parts.append(change.parts[~change.cut])
+    tracks = find_ballistic_tracks(parts, times, down)
+    moving = [i for i, each in enumerate(parts) if len(each)]
+    start = times[tracks[0].frames[0] if tracks else moving[0] if moving else 0]
+    window = np.flatnonzero((times >= start - _BEFORE) & (times <= start + duration))
+    return window[:: -(-len(window) // MAX_FRAMES)]
 
 
 def given_masks(masks: np.ndarray, times: np.ndarray, down: np.ndarray | None = None) -> VideoMasks:
@@ -132,27 +179,44 @@ def given_masks(masks: np.ndarray, times: np.ndarray, down: np.ndarray | None = 
 
 
 class _Change:
-    """Difference of a frame from the background.
+    """Difference of a frame from the background. Pictures are computed again when they are used.
 
     Attributes:
-        frame, empty: the frame, and the background at its exposure, (H, W, 3).
         noise: standard deviation of the camera's noise [levels].
-        strong: pixels that certainly differ, (H, W).
-        parts: their components (x, y, area), (N, 3).
+        parts: components (x, y, area) of the pixels that certainly differ, (N, 3).
         cut: which components touch the border, (N,).
     """
 
-    def __init__(self, frame: np.ndarray, background: np.ndarray):
-        self.frame, self.empty = frame, exposed(background, *match_exposure(frame, background))
+    def __init__(self, frames: Sequence[np.ndarray], number: int, background: np.ndarray):
+        self._frames, self._number, self._background = frames, number, background
+        frame = self.frame
+        self._exposure = match_exposure(frame, background)
         difference, shadow = compare(frame, self.empty)
         largest = largest_channel(np.abs(difference))
         self.noise = min(1.4826 * float(np.median(largest[::4, ::4])), _MAX_NOISE)
-        self.strong = opened((largest > _SURE) & ~shadow)
-        labels, sizes, middles = parts_of(self.strong)
-        enough = np.flatnonzero(sizes >= min_area(self.strong))
+        strong = opened((largest > _SURE) & ~shadow)
+        self._strong = np.packbits(strong)
+        labels, sizes, middles = parts_of(strong)
+        enough = np.flatnonzero(sizes >= min_area(strong))
         border = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
         self.parts = np.column_stack([middles[enough], sizes[enough]])
         self.cut = np.isin(enough + 1, border)
+
+    @property
+    def frame(self) -> np.ndarray:
+        """The frame, (H, W, 3)."""
+        return self._frames[self._number]
+
+    @property
+    def empty(self) -> np.ndarray:
+        """The background at the exposure of the frame, (H, W, 3)."""
+        return exposed(self._background, *self._exposure)
+
+    @property
+    def strong(self) -> np.ndarray:
+        """Pixels that certainly differ, (H, W)."""
+        shape = self._background.shape[:2]
+        return np.unpackbits(self._strong, count=shape[0] * shape[1]).reshape(shape).view(bool)
 
     def mask(
         self,
@@ -162,15 +226,16 @@ class _Change:
         in_flight: bool = False,
     ) -> np.ndarray:
         """The refined mask near a position, see `component`. Empty if there is no component."""
-        mask = component(self.strong, place, area, gate)
-        if in_flight and not mask.any() and not component(self.strong, place, area, 2 * gate).any():
+        strong, frame, empty = self.strong, self.frame, self.empty
+        mask = component(strong, place, area, gate)
+        if in_flight and not mask.any() and not component(strong, place, area, 2 * gate).any():
             # Only the object can be here. Blurred and dark, it was taken for a shadow.
-            largest = largest_channel(np.abs(self.frame - self.empty))
+            largest = largest_channel(np.abs(frame - empty))
             mask = component(opened(largest > _SURE), place, area, gate)
         if not mask.any():
             return mask
         box = box_of(mask, 2 * max(3, round(0.3 * radius_of(mask))))
-        difference, shadow = compare(self.frame[box], self.empty[box])
+        difference, shadow = compare(frame[box], empty[box])
         refined = _refined(difference, shadow, mask[box], max(_POSSIBLE, 3 * self.noise))
         return in_full(refined, box, mask.shape)
 
@@ -231,24 +296,19 @@ class _Drafts:
         return i, centroid(self.masks[i]), float(self.masks[i].sum())
 
 
-def _silhouettes(
+def _draw_silhouettes(
     changes: Sequence[_Change], masks: np.ndarray, tracks: Sequence[BallisticTrack]
-) -> np.ndarray:
-    """Masks refined with the colours of the object in its first flight. Unchanged without a flight."""
-    if not tracks:
-        return masks
-    flying = range(tracks[0].frames[0], tracks[0].frames[1] + 1)
+) -> None:
+    """Refine masks (T, H, W) in place with the colours of the object in its first flight."""
+    flying = range(tracks[0].frames[0], tracks[0].frames[1] + 1) if tracks else ()
     for _ in range(_ROUNDS):
-        pictures = ((changes[i].frame, changes[i].empty, masks[i]) for i in flying)
-        palette = learn_palette(*zip(*pictures))
+        palette = learn_palette((changes[i].frame, changes[i].empty, masks[i]) for i in flying)
         if palette is None:
             break
-        masks = masks.copy()
         for i in np.flatnonzero(masks.any(axis=(1, 2))):
             refined = silhouette(changes[i].frame, changes[i].empty, masks[i], palette)
             if refined.any():
                 masks[i] = refined
-    return masks
 
 
 def _refined(difference: np.ndarray, shadow: np.ndarray, mask: np.ndarray, possible: float) -> np.ndarray:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from neuma_lib.capture.calibration.vertical import Cue, check_vertical
 from neuma_lib.capture.masks.agreement import agreement
 from neuma_lib.capture.masks.regions import centroid
 from neuma_lib.capture.motion.contact import contact_time, lowest_points
@@ -39,7 +40,7 @@ class Filmed:
         camera: its name.
         numbers: of the frames, (T,).
         times: on its clock [s], (T,).
-        pixels: (T, H, W, 3), uint8.
+        pixels: T pictures, RGB or RGBA, (H, W, 3) or (H, W, 4), uint8.
         masks: (T, H, W).
         flight: numbers of the first and last frame of its first free flight. None without free flight.
         viewmat, K: in the room, (4, 4) and (3, 3).
@@ -52,7 +53,7 @@ class Filmed:
     camera: str
     numbers: np.ndarray
     times: np.ndarray
-    pixels: np.ndarray
+    pixels: Sequence[np.ndarray]
     masks: np.ndarray
     flight: tuple[int, int] | None
     viewmat: np.ndarray
@@ -97,7 +98,7 @@ class Flight:
     gravity: str
 
 
-def find_flight(views: Sequence[Filmed], name: str, metric: bool = True) -> Flight:
+def find_flight(views: Sequence[Filmed], name: str, metric: bool = True, cues: Sequence[Cue] = ()) -> Flight:
     """Fit the free flight of a take.
 
     A single camera requires a plane: the vertical one through the middle of the room that faces the camera.
@@ -106,10 +107,11 @@ def find_flight(views: Sequence[Filmed], name: str, metric: bool = True) -> Flig
         views: of the cameras. The first one is the time reference.
         name: of the take for messages.
         metric: whether the room's lengths are metres, so that gravity is checked.
+        cues: upward directions in the room, compared with gravity.
 
     Raises:
-        InputError: a camera shows no free flight, the time between two cameras is undetermined, no flight fits, or
-            gravity is significantly off by more than 10 %.
+        InputError: a camera shows no free flight, the time between two cameras is undetermined, no flight fits,
+            gravity is significantly off by more than 10 %, or its direction contradicts the cues.
     """
     tracks, inside = [], []
     for view in views:
@@ -135,6 +137,8 @@ def find_flight(views: Sequence[Filmed], name: str, metric: bool = True) -> Flig
     contact = _contact(views, inside, fall)
     if np.isfinite(contact):
         fall, kept = fit_flight(tracks, plane, fall.offsets, fixed, contact)
+    if cues:
+        check_vertical([*cues, fall.gravity.cue], name)
     gravity = (
         fall.gravity.check(name, tolerated=TOLERATED_DEVIATIONS) if metric else fall.gravity.describe(name)
     )
@@ -142,7 +146,9 @@ def find_flight(views: Sequence[Filmed], name: str, metric: bool = True) -> Flig
     for number, (view, flying, part) in enumerate(zip(views, inside, kept)):
         used = flying[part]
         frames.append((int(view.numbers[used[0]]), int(view.numbers[used[-1]])))
-        paths += follow(list(view.pixels[used]), view.masks[used], view.row_times[used], number)
+        paths += follow(
+            [view.pixels[i][..., :3] for i in used], view.masks[used], view.row_times[used], number
+        )
     spin = fit_spin(paths, tracks, fall)
     return Flight(fall, spin, frames, tracks, lines, _at_rest(views, fall.offsets), gravity)
 
@@ -214,7 +220,7 @@ def draw_flight(path: str | Path, flight: Flight, views: Sequence[Filmed], title
     *cameras, last = figure.subplots(1, len(views) + 1)
     for number, (axes, view, track) in enumerate(zip(cameras, views, flight.tracks)):
         fitted = flight.fall.seen(track, number)
-        axes.imshow(view.pixels[0] // 2 + 127)
+        axes.imshow(view.pixels[0][..., :3] // 2 + 127)
         axes.plot(*track.places.T, ".", label="seen")
         axes.plot(*fitted.T, "-", label="free flight")
         axes.set(title=view.camera, xlabel="x [px]", ylabel="y [px]")
@@ -223,5 +229,20 @@ def draw_flight(path: str | Path, flight: Flight, views: Sequence[Filmed], title
         last.plot(1000 * clock, np.linalg.norm(fitted - track.places, axis=1), ".-", label=view.camera)
     last.set(title="off the fit", xlabel="time [ms]", ylabel="[px]", yscale="log")
     last.legend()
+    figure.suptitle(title)
+    save_figure(path, figure)
+
+
+def draw_tracks(path: str | Path, views: Sequence[Filmed], title: str) -> None:
+    """Plot the positions of the object's centre in each camera, and which belong to its free flight."""
+    figure = new_figure(5 * len(views), 5)
+    for axes, view in zip(np.atleast_1d(figure.subplots(1, len(views))), views):
+        axes.imshow(view.pixels[0][..., :3] // 2 + 127)
+        axes.plot(*view.centroids.T, ".", label="seen")
+        if view.flight is not None:
+            flying = (view.numbers >= view.flight[0]) & (view.numbers <= view.flight[1])
+            axes.plot(*view.centroids[flying].T, "x", label="free flight")
+        axes.set(title=view.camera, xlabel="x [px]", ylabel="y [px]")
+        axes.legend()
     figure.suptitle(title)
     save_figure(path, figure)

@@ -12,11 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from neuma_lib.capture.calibration.vertical import UP, Cue
 from neuma_lib.config.simulation import GRAVITY
 from neuma_lib.errors import InputError
 
-UP = (0.0, 1.0, 0.0)
-"""The floor's normal in the room."""
 _MAX_MISMATCH = 0.1  # tolerated relative difference between measured and true gravity, as a vector
 _UNDECIDED = f"more than {_MAX_MISMATCH:.0%} off, but within its uncertainty: registration measures it again"
 
@@ -53,6 +52,11 @@ class Gravity:
         spread = np.trace(across @ self.covariance @ across) / 2
         angle = np.arctan2(np.linalg.norm(np.cross(down, -up)), -down @ up)
         return float(np.degrees(angle)), float(np.degrees(np.sqrt(spread) / size))
+
+    @property
+    def cue(self) -> Cue:
+        """The upward direction, against the acceleration."""
+        return Cue("gravity in the video", -self.a / np.linalg.norm(self.a), self.angle()[1])
 
     def describe(self, name: str, normal: Sequence[float] = UP) -> str:
         """One line of text, for the name of the videos and the upward normal (3,) of the floor."""

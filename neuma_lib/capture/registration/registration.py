@@ -145,7 +145,7 @@ def register(
         floor: height [m]. Frames in which the object would be below it, after the contact, are omitted. None: no floor.
 
     Raises:
-        InputError: the cameras have no common time, or the object does not match the video in any pose.
+        InputError: the cameras have no common time. `check_overlap` refuses an object that matches in no pose.
     """
     start = first_common(sights, name)
     parabola = parabola.at(start)
@@ -225,7 +225,6 @@ def register(
         axes=sights[0].viewmat[:3, :3],
         comparisons=pictures.comparisons(render(pictures, best, start), _COMPARISONS),
     )
-    _check(result, name)
     return result
 
 
@@ -372,7 +371,8 @@ def _agreement(pictures: Pictures, pose: FittedPose, start: float) -> Agreement:
     return pictures.agreement(renders, pictures.residuals(renders)[1].numpy())
 
 
-def _check(result: Registration, name: str) -> None:
+def check_overlap(result: Registration, name: str) -> None:
+    """Raises InputError if the object does not match the masks of the video in its best pose."""
     iou = result.after.iou.mean()
     if iou < _MIN_IOU:
         size = 100 * result.pose.enlargement

@@ -5,15 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from neuma_lib.capture.calibration.vertical import read_cues
 from neuma_lib.capture.masks.agreement import MIN_AGREEMENT
+from neuma_lib.capture.masks.continuity import Break
 from neuma_lib.config.simulation import GRAVITY
 
 _MAX_ERROR = 1.0  # mean reprojection error of good photographs [px]
 MAX_RESIDUAL = 0.5
 """Distance of the board's corners from the print for a flat board with the correct square size [mm]."""
 _MAX_UNSURE = 0.3  # standard deviation of a fixed camera's direction [degrees]
+_MAX_TILT = 5.0  # angle between upward directions of different cues [degrees]
 _MIN_FLOOR = 0.2  # share of the points on a floor with texture
 _MAX_LEFT_OUT = 0.1  # share of the photographs whose masks disagree with the others
+_MAX_SHIFT = 0.001  # of the background of a fixed camera, as share of the picture
 _MAX_JUMP = 0.1  # relative change of a good mask's area from frame to frame of free flight
 _MIN_OVERLAP = 0.9  # IoU of masks from videos with those of the placed object, in free flight
 MAX_TURN = 5.0
@@ -54,10 +58,18 @@ def checks(room: Mapping[str, Any], videos: Mapping[str, Mapping[str, Any]]) -> 
     if (share := room["share_of_points_on_floor"]) is not None:
         text, wanted = f"{100 * share:.0f} % of the points", f"> {100 * _MIN_FLOOR:.0f} %"
         result.append(Check("floor", text, wanted, share > _MIN_FLOOR))
+    if cues := read_cues(room.get("up", ())):
+        text = ", ".join(f"{c.name} {cues[0].angle(c):.1f} +- {c.deviation:.1f} degrees" for c in cues[1:])
+        good = all(cues[0].angle(cue) < _MAX_TILT + 2 * cue.deviation for cue in cues[1:])
+        wanted = f"< {_MAX_TILT:g} degrees, two deviations allowed"
+        result.append(
+            Check(f"upward direction, from the {cues[0].name}", text or "no other cue", wanted, good)
+        )
     for name, video in videos.items():
         slow = f", slowed {video['stretch']:g} times in the file" if video["stretch"] != 1 else ""
         text = f"{video['frames']} at {video['rate']:.2f} a second{slow}"
-        missing = len(video["lost_before"])
+        missing, repeated = len(video["lost_before"]), len(video["repeated"])
+        text += f", {repeated} repeated ones left out" if repeated else ""
         text += (
             f", missing at {missing} places" if missing else "" if video["steady"] else ", at a varying rate"
         )
@@ -76,6 +88,12 @@ def motion_checks(
     what = f"masks of photographs that agree (IoU > {MIN_AGREEMENT})"
     result = [Check(what, text, "nearly all", len(out) <= _MAX_LEFT_OUT * count)]
     for name, report in videos.items():
+        if shift := report.get("camera_shift"):
+            text, wanted = f"{100 * shift:.2f} % of the picture", f"< {100 * _MAX_SHIFT:g} %"
+            result.append(Check(f"motion of the camera in {name}", text, wanted, shift < _MAX_SHIFT))
+        if left_out := report.get("left_out"):
+            text = "; ".join(str(Break(**each)) for each in left_out)
+            result.append(Check(f"frames of {name} left out", text, "none", False))
         jump = report["largest_jump"]
         text = "no free flight" if jump is None else f"{100 * jump:.1f} %"
         good = jump is not None and jump < _MAX_JUMP
