@@ -57,13 +57,15 @@ def test_segments_do_not_change_the_gradient(cache_bytes):
     path, expected = gradients(model, law, start, **options)
     assert touches(model, path, start)
     segment, segments = 8, 5
-    states, step, grids = 8 * 36 * (segment + 1 + segments), 8 * 18, 8 * 12 * model.nodes**3
-    memory = len(start.x) * (states + step * (segment if cache_bytes else 1) + 8 * 9) + grids
+    states, grids = 8 * 36 * (segment + 1 + segments), 8 * 12 * model.nodes**3
+    step = 8 * (18 + 4) * len(start.x) + 8 * model.nodes**2
+    memory = len(start.x) * (states + 8 * 9) + step * (segment if cache_bytes else 1) + grids
     path, actual = gradients(model, law, start, memory=memory, **options)
     workspace = path.x.grad_fn.simulation.workspace
     assert workspace.size.n_checkpoints == segments
     buffers = (*workspace.states, *workspace.checkpoints)
-    buffers += (workspace.tau, workspace.F_trial, *workspace.native.grids[:, : model.nodes**3])
+    native = workspace.native
+    buffers += (workspace.tau, workspace.F_trial, native.kept, *native.grids[:, : model.nodes**3])
     assert 0.9 * memory < sum(buffer.nbytes for buffer in buffers) <= memory
     for one, other in zip(actual, expected, strict=True):
         assert torch.equal(one, other)

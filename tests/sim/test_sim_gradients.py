@@ -274,14 +274,15 @@ def test_checkpoints_do_not_change_the_gradient(cache_bytes, segment, total):
         assert_equal(grads, expected[-len(grads) :])
 
 
-@pytest.mark.parametrize("keeps_grids", [False, True])
+@pytest.mark.parametrize("rows", [60, 0])
 @pytest.mark.parametrize(("total", "contact"), [(False, False), (True, False), (False, True)])
-def test_a_plan_is_the_longest_segment_that_fits(keeps_grids, total, contact):
+def test_a_plan_is_the_longest_segment_that_fits(rows, total, contact):
     """Against a list of the sizes of all plans, in the order of preference."""
     steps, N, nodes, item = 13, 100, 500, 4
     state = item * N * (24 + 9 * total + 3 * contact)  # x, v, C, F; F_total; tangential displacement
-    step = item * (18 * N + 8 * nodes * keeps_grids)  # tau, F_trial; two grids
-    shared = 0 if keeps_grids else item * (12 * nodes + 9 * N)
+    step = item * 18 * N  # tau, F_trial
+    step += item * 4 * N + 8 * rows if rows else item * 8 * nodes  # touched nodes and their bounds; two grids
+    shared = item * (12 * nodes + 9 * N) if rows else 0
     sizes = {(steps, False): state * (steps + 1) + step + shared}  # all states, without checkpoints
     for caches in (True, False):
         for segment in range(steps, 0, -1):
@@ -289,7 +290,7 @@ def test_a_plan_is_the_longest_segment_that_fits(keeps_grids, total, contact):
             sizes.setdefault(
                 (segment, caches), state * (segment + 1 + math.ceil(steps / segment)) + kept + shared
             )
-    options = dict(total=total, contact=contact, keeps_grids=keeps_grids)
+    options = dict(total=total, contact=contact, rows=rows)
 
     def plan(memory, cache_bytes=math.inf):
         return plan_memory(steps, N, nodes, item, cache_bytes, memory, **options)

@@ -228,7 +228,7 @@ def test_gradients_of_constants(monkeypatch):
 
     expected = grads(scatter="atomic")
     assert all(grad != 0 for grad in expected)
-    for options in ({}, {"cache_bytes": 0}, {"memory": 9e5}):
+    for options in ({}, {"cache_bytes": 0}, {"memory": 9.5e5}):
         assert_near(grads(**options), expected, 1e-9)
     monkeypatch.setattr(segment_loop, "PARTICLE_STEPS", 3 * len(start.x))
     assert_near(grads(), expected, 1e-9)
