@@ -3,7 +3,8 @@
 python -m benchmarks.default_grid BouncyBall_converged ... [--grids 24 36 48] [--particles 1000 2000 4000] [--out FILE]
 
 Reads truth.h5 of scenes with `truth: converged`. The time step is that of the scene on its grid, divided by the factors
-`--substeps` and rounded down to keep the Courant number on finer grids. Prints root mean square distances of 2,000
+`--substeps` and rounded down to keep the Courant number on finer grids, or with `--courant` the largest with at most
+this Courant number of the law. Prints root mean square distances of 2,000
 tracers over the frames [mm], averaged over the scenes, and the core seconds of a forward simulation of all of them.
 """
 
@@ -11,6 +12,7 @@ from __future__ import annotations
 
 import math
 import time
+from fractions import Fraction
 from itertools import product
 from pathlib import Path
 
@@ -32,21 +34,26 @@ TRACERS = 2000
 
 
 def error_of(
-    settings, name: str, grid: int, particles: int, substeps: int, contact: str
+    settings, name: str, grid: int, particles: int, substeps: int, contact: str, courant: float | None = None
 ) -> tuple[float, float]:
     """Tracer RMSE [mm], infinite if it diverges, and core seconds of a scene."""
     scene = settings.scene(name)
     arrays, _ = read_arrays(Path(settings.data_root) / name / "truth.h5", only=("tracers", "frames"))
     tracers = torch.from_numpy(arrays["tracers"])
     tracers = tracers[:, :: max(1, tracers.shape[1] // TRACERS)].contiguous()
-    factor = substeps * math.ceil(grid / settings.simulation.grid)
-    model = MPM(grid, scene.dt / factor, contact=contact)
+    frames = [int(n) for n in arrays["frames"]]
+    factor = Fraction(substeps * math.ceil(grid / settings.simulation.grid))
+    if courant:
+        given = MPM(grid, scene.dt).courant(analytic_law(scene.law.plain(), scene.dt), scene.density)
+        interval = math.gcd(*frames)
+        factor = Fraction(math.ceil(interval * given / courant), interval)
+    model = MPM(grid, scene.dt / float(factor), contact=contact)
     mesh = place(scene.shape, scene.size, scene.height, scene.center)
     x = torch.as_tensor(sample_volume(mesh, particles, seed=7), dtype=torch.float32)
     vol0 = torch.full((len(x),), float(mesh.volume) / len(x))
     state = State.rigid(x, scene.density * vol0, vol0, scene.velocity, scene.spin)
     law = analytic_law(scene.law.plain(), model.dt)
-    frames = [factor * int(n) for n in arrays["frames"]]
+    frames = [int(factor * n) for n in frames]
     before = time.process_time()
     try:
         with torch.no_grad():
@@ -62,6 +69,7 @@ def main() -> None:
     parser.add_argument("--grids", type=int, nargs="*", default=[24, 30, 36, 48])
     parser.add_argument("--particles", type=int, nargs="*", default=[1000, 2000, 4000, 8000])
     parser.add_argument("--substeps", type=int, nargs="*", default=[1])
+    parser.add_argument("--courant", type=float, help="largest Courant number, instead of --substeps")
     parser.add_argument("--contacts", nargs="*", default=["particles"])
     parser.add_argument("--out", type=Path, help="JSON file for all numbers")
     args = parser.parse_args()
@@ -75,7 +83,8 @@ def main() -> None:
         args.contacts, args.grids, args.particles, args.substeps
     ):
         each = [
-            error_of(settings, name, grid, particles, substeps, contact) for name, settings in scenes.items()
+            error_of(settings, name, grid, particles, substeps, contact, args.courant)
+            for name, settings in scenes.items()
         ]
         errors, seconds = zip(*each, strict=True)
         mean = sum(errors) / len(errors)
