@@ -381,7 +381,7 @@ def _of_newton(kind: str, given: Arguments, substep: float | None):
         raise InputError(
             "mpm.yield_pressure", f"{a['yield_pressure']:g} Pa: crushing has no counterpart here"
         )
-    if shear + friction * strength >= 1e3 * E:  # yields nowhere
+    if shear + friction * strength >= 1e3 * E:  # never yields
         return _solid("hencky", E, nu), None
     flow = {"viscosity": float(a["viscosity"])} if a["viscosity"] else {}
     if friction == 0 and strength >= 1e3 * E:

@@ -18,7 +18,9 @@ import torch
 from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.laws import load_law
+from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.paper.image_grid import load_image_grid
+from neuma_lib.sim.model import MPM
 from tests.support import full_run
 from tests.support.errors import refused
 from tests.support.project import SCENE, TABLE, Plan, Project, copied, overlay, wait_for
@@ -186,6 +188,10 @@ def test_the_true_law_is_evaluated_without_training_or_prior(full):
     )
     # The tiny scene is short: the error of the start, which all laws share, is nearly all of both errors.
     assert 0 < true["tracer_rmse_mm"] < 1.1 * prior["tracer_rmse_mm"] and true["stable"]
+    # The wave speed tells which law was simulated.
+    law = analytic_law({"elasticity": {"name": "fixed_corotated", "E": 3e4, "nu": 0.45}}, dt=2e-3)
+    assert true["courant"] == pytest.approx(MPM(grid=14, dt=2e-3).courant(law, 1000.0), rel=1e-6)
+    assert prior["courant"] != pytest.approx(true["courant"], rel=1e-4)
 
 
 def test_the_demo_makes_a_page_and_a_law_that_a_scene_can_start_from(full, clone):
