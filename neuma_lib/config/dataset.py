@@ -6,12 +6,10 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from neuma_lib.config.base import Section, Seed
+from neuma_lib.config.base import Section, Seed, internal
 from neuma_lib.config.blender import BlenderConfig, ImagesConfig
 
 CONVERGED = "converged"
-CONVERGED_CELLS = 96
-"""Least number of grid cells along each side of a converged truth."""
 
 Cells = Annotated[int, Field(ge=8)]
 
@@ -41,9 +39,12 @@ class DatasetConfig(Section):
     )
     grid: Cells | Literal["converged"] | None = Field(
         None,
-        description="grid cells of the ground truth along each side; null: simulation.grid; converged: the least "
-        "even multiple of simulation.grid from 96, with a time step refined by the same factor, 8 particles in a "
+        description="grid cells of the ground truth along each side; null: simulation.grid; converged: 96 cells, or "
+        "twice simulation.grid if that is more, with a time step refined by at least the same factor, 8 particles in a "
         "cell, and, unless truth.particles is given, an estimate of the change that a doubled grid would make",
+    )
+    converged_grid: int = internal(
+        96, "grid cells of a converged ground truth along each side, an even number", ge=8, multiple_of=2
     )
     dt: float | None = Field(
         None,

@@ -42,8 +42,8 @@ class IdentifyConfig(Section):
         description="particles of the bodies on the finer grid, more than `geometry.particles`; 0: no finer grid, and "
         "no constants of the material",
     )
-    refinement: int = internal(
-        2, "grid cells and steps of the finer grid, relative to the simulation's", ge=2
+    refinement: float = internal(
+        1.5, "grid cells and steps of the finer grid, relative to the simulation's", ge=1.25
     )
     pose_tolerance: float = internal(1e-3, "expected shift [m] and enlargement of the rendered body", ge=0)
     held_out: float = internal(

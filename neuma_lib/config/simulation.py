@@ -21,7 +21,7 @@ CONDITIONS = ("no_slip", "slip", "sticky")
 class SimulationConfig(Section):
     """The material point method."""
 
-    grid: int = Field(24, ge=8, description="grid cells along each side of the unit cube")
+    grid: int = Field(36, ge=8, description="grid cells along each side of the unit cube")
     gravity: Vector = Field((0.0, -9.8, 0.0), description="acceleration [m/s^2]")
     contact: Literal["particles", "nodes", "released"] = Field(
         "particles",

@@ -12,14 +12,15 @@ from neuma_lib.errors import InputError
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.catalogue import ELASTICITY, PLASTICITY, POISSON, Constant
 from neuma_lib.mechanics.combinations import Values
-from neuma_lib.sim.model import COURANT_LIMIT, MPM
+from neuma_lib.sim.model import MPM
 
 _PARTS = {"elasticity": ELASTICITY, "plasticity": PLASTICITY}
 FRICTION = "contact_friction"
 """Name of the Coulomb coefficient of a body and its obstacles, a constant that belongs to no law."""
 _FRICTION_GUESS = 0.5
 _NO_FLOW = ("E", "nu", FRICTION)
-_LIMIT_SHARE = 0.999  # of the largest stable stiffness, since constants are rounded
+MAX_COURANT = 0.7
+"""Largest Courant number of fitted constants. A correction may stiffen the law up to `catalogue.COURANT_LIMIT`."""
 _MAX_LOGIT = 12.0  # logits beyond it equal the bound to six digits
 
 
@@ -90,10 +91,10 @@ class Family:
         return np.array([self._unbounded(key, values[key]) for key in self.constants])
 
     def values(self, unbounded: np.ndarray, model: MPM, density: float) -> Values:
-        """Constants from unbounded ones, with E limited to what the time step admits at a density [kg/m^3]."""
+        """Constants from unbounded ones, with E limited at a density [kg/m^3] by `MAX_COURANT`."""
         values = self.bounded(unbounded)
         unit = analytic_law(self.law_spec({**values, "E": 1.0}), model.dt)
-        stiffest = _LIMIT_SHARE * (COURANT_LIMIT / model.courant(unit, density)) ** 2
+        stiffest = (MAX_COURANT / model.courant(unit, density)) ** 2
         return {**values, "E": min(values["E"], stiffest)}
 
     def bounded(self, unbounded: np.ndarray) -> Values:

@@ -74,7 +74,7 @@ class FamilyFit:
             shared = {key: tie.values.get(key, value) for key, value in first.values.items()}
             self.covariance += np.outer(u(shared) - before, u(shared) - before) / (len(ties) + 1)
 
-    def extrapolated(self, coarse: FamilyFit, refinement: int) -> FamilyFit:
+    def extrapolated(self, coarse: FamilyFit, refinement: float) -> FamilyFit:
         """This fit, of a grid with ``refinement`` times as many cells as that of another fit, extrapolated to dx = 0.
 
         Errors of the unbounded constants decrease with dx (thin limbs, layers near the floor) or with dx^2 (smooth

@@ -7,8 +7,9 @@ shorter time steps and more particles, may be simulated instead.
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -62,6 +63,19 @@ class _Discretisation:
     body: Reconstruction
     films: list[Filmed]
     kernels: object = field(default_factory=object)  # key of `in_threads`
+
+
+def finer(model: MPM, refinement: float, steps: Sequence[int]) -> MPM:
+    """The model with ``refinement`` times as many cells along an edge and at least as many times the time steps.
+
+    Steps of the model at ``steps`` are whole numbers of its steps.
+    """
+    between = math.gcd(*steps) or 1
+    return replace(
+        model,
+        grid=round(refinement * model.grid),
+        dt=model.dt * between / math.ceil(refinement * between - 1e-9),
+    )
 
 
 class VideoResiduals:
@@ -121,9 +135,7 @@ class VideoResiduals:
 
         self._coarse, self._fine = discretised(model, body), None
         if refined is not None:
-            factor = settings.refinement
-            fine = replace(model, grid=factor * model.grid, dt=model.dt / factor)
-            self._fine = discretised(fine, refined)
+            self._fine = discretised(finer(model, settings.refinement, self._steps), refined)
         sizes = [
             [max(1, round(each.cameras.width / across)) for across in settings.pyramid] for each in observed
         ]
@@ -203,12 +215,12 @@ class VideoResiduals:
             on.model if one.friction is None else on.model.with_friction(one.friction) for one in candidates
         ]
         flights = [self._flight(on, *each) for each in zip(candidates, laws, starts, strict=True)]
-        substeps, paths = round(self.model.dt / on.model.dt), [None] * len(candidates)
+        paths: list[Trajectory | None] = [None] * len(candidates)
         for flown in {len(flight.frames) for flight in flights}:
             own = [i for i, flight in enumerate(flights) if len(flight.frames) == flown]
             flown = min(flown, len(frames) - 1)
             first = frames[flown - 1] if flown else 0
-            later = [substeps * (n - first) for n in frames[flown:]]
+            later = self._steps_of(on, (n - first for n in frames[flown:]))
             simulated = rollout_batch(
                 [models[i] for i in own],
                 [laws[i] for i in own],
@@ -222,13 +234,16 @@ class VideoResiduals:
                 paths[i] = flights[i].first(flown).followed_by(path) if path and flown else path
         return paths, [len(flight.frames) for flight in flights]
 
+    def _steps_of(self, on: _Discretisation, steps: Iterable[int]) -> list[int]:
+        """Steps of a discretisation at the times of steps of the model."""
+        return [round(n * self.model.dt / on.model.dt) for n in steps]
+
     def _flight(self, on: _Discretisation, one: Candidate, law: Law, start: State) -> Trajectory:
         """States before the first contact of a spinning body that its law keeps rigid, without frames if there are
         none."""
         key = (on is self._fine, one.deviations[:MOTION].tobytes())
         if key not in self._flights:
-            substeps = round(self.model.dt / on.model.dt)
-            flight = rigid_flight(on.model, start, [substeps * n for n in self._steps], self._total)
+            flight = rigid_flight(on.model, start, self._steps_of(on, self._steps), self._total)
             clear = first_contact(on.model, flight.x, start.vol0, flight.frames)
             flight = replace(flight, frames=self._steps)
             self._flights = {**dict(list(self._flights.items())[-_KEPT:]), key: flight.first(clear)}

@@ -160,7 +160,9 @@ class RandomConfig(Section):
     duration: PositiveRange = internal((0.26, 0.34), "duration of the video [s]")
     contact: Range = internal((0.2, 0.5), "time of the first contact as a fraction of the video")
     dt: tuple[PositiveFloat, ...] = internal(
-        (1e-3, 5e-4), "time steps, of which the largest stable one is used [s]", min_length=1
+        (1e-3, 1 / 1500, 5e-4, 1 / 3000),
+        "time steps, of which the largest stable one is used [s]",
+        min_length=1,
     )
     courant: float = internal(
         0.6,

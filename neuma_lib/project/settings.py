@@ -13,7 +13,7 @@ from pydantic import Field
 from neuma_lib.config.base import Section, Seed
 from neuma_lib.config.binding import BindingConfig
 from neuma_lib.config.capture import CapturesConfig
-from neuma_lib.config.dataset import CONVERGED, CONVERGED_CELLS, DatasetConfig, TruthConfig
+from neuma_lib.config.dataset import CONVERGED, DatasetConfig, TruthConfig
 from neuma_lib.config.demo import DemoConfig
 from neuma_lib.config.evaluation import EvaluationConfig
 from neuma_lib.config.experiments import ExperimentConfig
@@ -187,10 +187,10 @@ class Config(Section):
     def _truth(self, own: TruthConfig, dt: float, origin: str) -> TruthConfig:
         grid = own.grid or self.dataset.grid or self.simulation.grid
         if grid == CONVERGED:
-            factor = 2 * math.ceil(CONVERGED_CELLS / (2 * self.simulation.grid))
-            return TruthConfig(
-                grid=factor * self.simulation.grid, dt=own.dt or dt / factor, particles=own.particles
-            )
+            cells = max(self.dataset.converged_grid, 2 * self.simulation.grid)
+            # A truth of half the grid takes half as many steps.
+            factor = 2 * math.ceil(cells / (2 * self.simulation.grid))
+            return TruthConfig(grid=cells, dt=own.dt or dt / factor, particles=own.particles)
         step = own.dt or self.dataset.dt or dt
         substeps = round(dt / step)
         if substeps < 1 or abs(dt / step - substeps) > 1e-6 * substeps:

@@ -14,7 +14,7 @@ from neuma_lib.config.laws import LawConfig
 from neuma_lib.config.training import TrainingConfig
 from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.errors import NonFiniteError
-from neuma_lib.fitting.families import Family
+from neuma_lib.fitting.families import MAX_COURANT, Family
 from neuma_lib.fitting.family_run import FamilyRun
 from neuma_lib.fitting.frame_batches import check_contact, first_contact
 from neuma_lib.fitting.identified import FamilyFit, Identified
@@ -28,15 +28,15 @@ from neuma_lib.fitting.least_squares import (
     levenberg_marquardt,
     secant_update,
 )
-from neuma_lib.fitting.video_residuals import Candidate, VideoResiduals, averaged
+from neuma_lib.fitting.video_residuals import Candidate, VideoResiduals, averaged, finer
 from neuma_lib.io.files import write_json
 from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.mechanics.catalogue import COURANT_LIMIT
 from neuma_lib.mechanics.combinations import named_combinations
 from neuma_lib.methods.base import Problem
 from neuma_lib.methods.spring_gaus.method import SpringGaus
 from neuma_lib.methods.training import Training
 from neuma_lib.sim.colliders import contact_radius
-from neuma_lib.sim.model import COURANT_LIMIT
 from neuma_lib.sim.rigid_flight import rigid_flight
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
@@ -207,8 +207,8 @@ def test_videos_count_alike_however_long():
 def test_two_grids_give_the_constants_of_the_material():
     """The video is of a body of many particles on a grid three times as fine as that of the fit.
 
-    Constants of the material are closer to the truth than those of the coarse grid, which the second grid does not
-    change.
+    Constants of the material are closer to the truth than those of the coarse grid, which the second grid hardly
+    changes. The coarse grid hides a large error of nu behind a small one of E.
     """
     truth, families = law("hencky", E=3e4, nu=0.35), {"hencky": ELASTIC}
     body = ball()
@@ -234,15 +234,15 @@ def test_two_grids_give_the_constants_of_the_material():
     )
     cameras = camera(32, few.x0.dtype)
     seen = Observation(FRAMES, many.particle_gs(cameras)(path.x, path.F), cameras)
-    options = settings(families, covariance_from="elastic")
+    options = settings(families, covariance_from="elastic", refinement=2)
     one = identify(coarse, known(few), few, seen, options)
     two = identify(coarse, known(few), few, seen, options, refined=[filled(6000)])
     error = {
-        name: abs(math.log(fit.values["E"] / 3e4))
+        name: abs(math.log(fit.values["E"] / 3e4)) + abs(fit.values["nu"] - 0.35)
         for name, fit in (("alone", one.best), ("grid", two.best), ("material", two.material))
     }
     assert one.material is None and error["material"] < error["grid"] / 2
-    assert two.best.values["E"] == pytest.approx(one.best.values["E"], rel=0.02)
+    assert two.best.values["E"] == pytest.approx(one.best.values["E"], rel=0.05)
     written = two.as_dict()
     assert written["grid"] == 24 and written["law"] != written["material"]["law"]
     assert "of the material" in written["says"]
@@ -292,7 +292,17 @@ def test_the_finer_grid_decides_between_families_of_similar_scores(monkeypatch):
     assert len([text for text in messages if "no constants of the material" in text]) == 1, "not asked for"
 
 
-@pytest.mark.parametrize("refinement", [2, 3])
+@pytest.mark.parametrize(
+    "steps, substeps", [((0, 8, 16, 24), 12 / 8), ((0, 7, 14), 11 / 7), ((0, 1, 4), 2.0)]
+)
+def test_steps_of_the_model_are_whole_steps_of_the_finer_grid(steps, substeps):
+    """The time step is divided by at least as much as the spacing of the nodes."""
+    fine = finer(MODEL, 1.5, steps)
+    assert fine.grid == 24 and MODEL.dt / fine.dt == pytest.approx(substeps, rel=1e-12)
+    assert all(abs(n * MODEL.dt / fine.dt - round(n * MODEL.dt / fine.dt)) < 1e-9 for n in steps)
+
+
+@pytest.mark.parametrize("refinement", [1.5, 2])
 def test_an_extrapolation_covers_both_orders_of_convergence(refinement):
     """Errors of log E that are proportional to dx^2 vanish, those that are proportional to dx are one standard
     deviation."""
@@ -586,7 +596,8 @@ def test_unbounded_constants_return_and_stay_within_bounds_and_the_time_step():
         values = family.values(np.array([abs(far), far, far]), MODEL, DENSITY)
         assert 0 < values["nu"] < 0.5 and 0 < values["friction_angle"] < 90
         number = MODEL.check_courant(analytic_law(family.law_spec(values)), DENSITY)
-        assert number == pytest.approx(COURANT_LIMIT, rel=1e-3) or values["E"] < 1e-3
+        assert number == pytest.approx(MAX_COURANT, rel=1e-3) or values["E"] < 1e-3
+        assert MAX_COURANT < 0.9 * COURANT_LIMIT, "a correction may stiffen the law by a fifth"
 
 
 def test_constants_between_any_bounds_are_unbounded_and_return():

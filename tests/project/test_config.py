@@ -388,10 +388,10 @@ class TestTruth:
 
     def test_resolution(self, loaded, changed):
         """It is that of simulation and scene by default, or that of all truths, or of one."""
-        assert self.values(loaded.scene_truth("BouncyBall")) == (24, 1e-3, 8000)
-        assert self.values(loaded.experiment_truth("letter_N_sand")) == (24, 5e-4, 8000)
+        assert self.values(loaded.scene_truth("BouncyBall")) == (36, 1e-3, 8000)
+        assert self.values(loaded.experiment_truth("letter_N_sand")) == (36, 5e-4, 8000)
         refined = {"grid": 40, "dt": 2.5e-4, "particles": 9000}
-        own = changed(dataset=refined, scenes={"ClayCat": {"truth": {"grid": 50}}})
+        own = changed(dataset=refined, scenes={"ClayCat": {"truth": {"grid": 50}}}, random={"count": 0})
         assert self.values(own.scene_truth("BouncyBall+seed=2")) == (40, 2.5e-4, 9000)
         assert self.values(own.scene_truth("ClayCat")) == (50, 2.5e-4, 9000)
         assert self.values(own.experiment_truth("letter_N_clay")) == (40, 2.5e-4, 9000)
@@ -406,7 +406,7 @@ class TestTruth:
             assert plain.dt == pytest.approx(4 * refined.dt)
             assert loaded.scene(name).law == loaded.scene(scene).law
         assert not {*table.scenes, *loaded.random_scenes} & set(loaded.plain_scenes)
-        for grid, truth in ((32, 128), (36, 144), (48, 96)):
+        for grid, truth in ((24, 96), (32, 96), (64, 128)):
             other = changed(simulation={"grid": grid}, random={"count": 0})
             assert other.scene_truth(table.scenes[0]).grid == truth
         everywhere = changed(dataset={"grid": "converged"})

@@ -29,7 +29,7 @@ GRAVITY = (0.0, -9.8, 0.0)
 SEEDS = range(8)
 
 
-def drawn(loaded, grid=24, **changes):
+def drawn(loaded, grid=36, **changes):
     chosen = loaded.random.model_validate({**loaded.random.plain(), **changes})
     return draw_scenes(chosen, loaded.priors.laws, grid, GRAVITY)
 
@@ -94,7 +94,7 @@ def test_draws_do_not_depend_on_the_order_of_keys(loaded):
 
 def test_every_machine_draws_the_same(loaded):
     text = json.dumps(drawn(loaded), sort_keys=True)
-    assert hashlib.sha256(text.encode()).hexdigest()[:16] == "9ccd2f814a104e9e"
+    assert hashlib.sha256(text.encode()).hexdigest()[:16] == "7269dd5022c97980"
 
 
 def test_materials_outside_the_families_are_drawn_on_request(loaded):
@@ -107,7 +107,7 @@ def test_materials_outside_the_families_are_drawn_on_request(loaded):
         assert {name.split("_", 3)[3] for name in scenes} == families
         for scene in scenes.values():
             law = analytic_law(scene["law"], dt=scene["dt"])
-            assert MPM(grid=24, dt=scene["dt"]).courant(law, DENSITY) <= 0.6 * (1 + 1e-3)
+            assert MPM(grid=36, dt=scene["dt"]).courant(law, DENSITY) <= 0.6 * (1 + 1e-3)
     assert not {*random.families} & {*random.outside}
 
 
@@ -145,7 +145,7 @@ def test_constants_lie_in_their_ranges(loaded, many):
 
 def test_both_the_true_law_and_the_prior_are_stable(loaded, many):
     for scene in many.values():
-        model = MPM(grid=24, dt=scene["dt"])
+        model = MPM(grid=36, dt=scene["dt"])
         for law in (scene["law"], loaded.priors.laws[scene["prior"]].plain()):
             # The modulus is measured by differences of 1e-5, which leaves that order of relative error.
             assert model.courant(analytic_law(law, dt=scene["dt"]), DENSITY) <= 0.6 * (1 + 1e-3)
