@@ -381,7 +381,7 @@ def test_a_folder_of_results_is_exported(project, capsys):
     about = json.loads(capsys.readouterr().out.split("\n", 1)[1])
     assert about["metrics"] == {"tracer_rmse_mm": 3.5, "stable": True}
     assert (
-        about | {"scene": "ClayCat", "method": "neuma", "prior": "plasticine", "dt": DT, "grid": 24} == about
+        about | {"scene": "ClayCat", "method": "neuma", "prior": "plasticine", "dt": DT, "grid": 36} == about
     )
     assert about | {"density": 1000.0, "gravity": [0.0, -9.8, 0.0], "scale": 1.0, "kind": "networks"} == about
     # the frame before contact is left out, so that what is seen is what the other one has
@@ -389,7 +389,7 @@ def test_a_folder_of_results_is_exported(project, capsys):
     assert seen["stretch"] == pytest.approx([float(sigma[:, 2].min()), float(sigma[:, 0].max())])
     assert seen["shear_stress"] > 0
     card = target.with_suffix(".md").read_text()
-    for text in ("ClayCat / neuma", "plasticine, 1.0", "24 cells", "| tracer RMSE [mm] | 3.5 |", f"{DT:g}"):
+    for text in ("ClayCat / neuma", "plasticine, 1.0", "36 cells", "| tracer RMSE [mm] | 3.5 |", f"{DT:g}"):
         assert text in card, text
     assert f"{seen['stretch'][0]:.4g}, {seen['stretch'][1]:.4g}" in card and "absorbed discretisation" in card
     assert "Other time steps" in card and "None" not in card
