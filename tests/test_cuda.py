@@ -1,10 +1,12 @@
 """The CPU and a CUDA GPU run the same functions and agree. Skipped without a GPU."""
 
 import copy
+import gc
 from dataclasses import replace
 
 import pytest
 import torch
+import warp as wp
 
 from neuma_lib.config.binding import BindingConfig
 from neuma_lib.config.training import TrainingConfig
@@ -22,6 +24,7 @@ from neuma_lib.methods.pac_nerf.rendering import render as render_field
 from neuma_lib.methods.spring_gaus.body import SpringBody
 from neuma_lib.methods.spring_gaus.network import Springs
 from neuma_lib.methods.spring_gaus.rollout import SpringModel, spring_rollout
+from neuma_lib.sim.graphs import GraphCache
 from neuma_lib.sim.model import MaterialRegion
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
@@ -172,6 +175,26 @@ def test_graphs_of_one_body_survive_a_rollout_of_two(drop):
         x_again, grad_again = gradient(law, arguments)
         assert relative(x_two, x) < 1e-5 and relative(x_again, x) < 1e-5
         assert relative(grad_again, grad) < 1e-3
+
+
+def test_garbage_does_not_end_the_recording_of_a_graph():
+    """An array in a reference cycle, which only the garbage collector releases, would invalidate it."""
+
+    class Owner:
+        def __init__(self):
+            self.array, self.itself = wp.zeros(1024, device="cuda"), self
+
+    def launches():
+        x.add_(1)
+        for _ in range(2000):  # more objects than the collector's first threshold
+            kept.append([])
+
+    x, kept, cache = torch.zeros(8, device="cuda"), [], GraphCache()
+    cache.run("add", launches)
+    Owner()
+    cache.run("add", launches)
+    cache.run("add", launches)
+    assert gc.isenabled() and (x == 3).all()
 
 
 def test_prediction_without_gradient_replays_too(drop):

@@ -6,6 +6,7 @@ steps is therefore recorded once and replayed, on buffers with fixed addresses (
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable, Hashable
 
 import torch
@@ -37,7 +38,14 @@ class GraphCache:
 
 
 def _record(launches: Callable[[], None]) -> torch.cuda.CUDAGraph:
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph, capture_error_mode="thread_local"):
-        launches()
+    # The garbage collector may release an array, which invalidates a recording.
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+            launches()
+    finally:
+        if collects:
+            gc.enable()
     return graph
