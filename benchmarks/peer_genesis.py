@@ -1,6 +1,6 @@
 """Rollout of a case in Genesis, by its public interface: `Scene.step`, and the backward pass of its states.
 
-Genesis allocates a grid for each step that it differentiates, so that forward runs in a scene of its own.
+Genesis allocates a grid for each step that it differentiates, so that forward runs in another scene.
 """
 
 from __future__ import annotations
