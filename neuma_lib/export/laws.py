@@ -18,7 +18,7 @@ from neuma_lib.io.mjcf import read_elasticity
 from neuma_lib.io.usd_particles import read_material
 from neuma_lib.mechanics.adaptor import AdaptableLaw
 from neuma_lib.mechanics.analytic import analytic_law, specification
-from neuma_lib.mechanics.catalogue import ELASTICITY, PLASTICITY
+from neuma_lib.mechanics.catalogue import ELASTICITY, PLASTICITY, VISCOSITY
 from neuma_lib.mechanics.law import Law
 from neuma_lib.mechanics.structured import StructuredLaw
 
@@ -137,7 +137,7 @@ def _fitted(law: Law, known, engine: str, states: Tensor | None, force: bool, su
 
 def _of_world(spec: Mapping[str, Any], scale: float) -> dict[str, Any]:
     """A law with constants of the filmed world: stresses and viscosities at the same density scale with length^2."""
-    known = {"elasticity": ELASTICITY, "plasticity": PLASTICITY}
+    known = {"elasticity": ELASTICITY, "plasticity": PLASTICITY, "viscosity": VISCOSITY}
 
     def unit(part: str, name: str, key: str) -> str:
         return known[part][name][key].unit if key in known[part][name] else ""
