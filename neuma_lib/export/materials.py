@@ -77,8 +77,8 @@ def engine_material(
             problem = f"{plastic[key]:g} must equal elasticity.{key} = {elastic[key]:g} in {engine}"
             raise InputError(f"plasticity.{key}", problem)
     constants = {**elastic, **plastic}
-    if (problem := _refusal(engine, names, constants)) is not None:
-        others = [other for other in ENGINES if _refusal(other, names, constants) is None]
+    if (problem := refusal(engine, names, constants)) is not None:
+        others = [other for other in ENGINES if refusal(other, names, constants) is None]
         remedy = f"{' and '.join(others) or 'No engine'} can. --fit fits the nearest one"
         raise InputError(f"law {' + '.join(names)}", f"{engine} has no such material: {problem}", remedy)
     kind, arguments, *notes = RULES[engine][names](constants, substep)
@@ -101,8 +101,8 @@ def _positive(name: str, value: Any, unit: str) -> float:
     return float(value)
 
 
-def _refusal(engine: str, names: Names, constants: Values) -> str | None:
-    """Why an engine does not have a law, or None."""
+def refusal(engine: str, names: Names, constants: Values) -> str | None:
+    """Why an engine does not have a law with these constants, or None."""
     if names not in RULES[engine]:
         return f"it has {', '.join(map(' + '.join, RULES[engine]))}"
     able, problem = _LIMITS.get((engine, names[1]), (lambda c: True, None))

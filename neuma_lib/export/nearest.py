@@ -14,7 +14,7 @@ from torch import Tensor
 
 from neuma_lib.errors import InputError
 from neuma_lib.evaluation.material_point import returned, stress
-from neuma_lib.export.materials import RULES, check_engine
+from neuma_lib.export.materials import RULES, check_engine, refusal
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.law import Law
 
@@ -78,7 +78,7 @@ def nearest(law: Law, states: Tensor, engine: str, dt: float) -> Fit:
         )
     trial = trial_states(F)
     after = stress(law, returned(law, trial))
-    fits = [_fit(names, F, tau, trial, after, dt) for names in RULES[engine]]
+    fits = [_fit(engine, names, F, tau, trial, after, dt) for names in RULES[engine]]
     able = [fit for fit in fits if fit is not None]
     enough = min(fit.error for fit in able) + 0.01  # a simpler law is preferred to 1 % of the stress
     return min(
@@ -112,7 +112,7 @@ def sampled_states(visited: Mapping[str, Any], count: int = 2000, seed: int = 0)
     return torch.from_numpy((U * np.exp(logs[inside][:count])[:, None]) @ V.transpose(0, 2, 1))
 
 
-def _fit(names, F: Tensor, tau: Tensor, trial: Tensor, after: Tensor, dt: float) -> Fit | None:
+def _fit(engine: str, names, F: Tensor, tau: Tensor, trial: Tensor, after: Tensor, dt: float) -> Fit | None:
     """Fit one family, or None if it is not fitted."""
     elastic, plastic = names
     if plastic not in _STARTS:
@@ -136,6 +136,10 @@ def _fit(names, F: Tensor, tau: Tensor, trial: Tensor, after: Tensor, dt: float)
     starts = {
         key: [max(value * scales[key], 1e-9) for value in values] for key, values in _STARTS[plastic].items()
     }
+    if refusal(
+        engine, names, {"nu": 0.3, "cohesion": 0.0, **{key: values[0] for key, values in starts.items()}}
+    ):
+        starts.pop("yield_stress")  # Genesis has viscous flow without it
 
     def spec(logs) -> dict[str, Any]:
         constants = dict(zip(starts, np.exp(logs).tolist(), strict=True))

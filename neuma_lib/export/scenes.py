@@ -119,8 +119,10 @@ class EngineScene:
 
 def write_law_scene(
     path: str | Path, engine: str, material: EngineMaterial, about: Mapping[str, Any]
-) -> None:
-    """Write a file that the engine loads: ``.usda`` or ``.xml`` of a falling cube, or ``.json`` of the material alone.
+) -> list[str]:
+    """Write a file that the engine loads, ``.usda`` or ``.xml`` of a falling cube, or ``.json`` of the material alone.
+
+    Returns the notes.
 
     Args:
         about: as of `neuma_lib.export.laws.law_for_engine`.
@@ -139,6 +141,7 @@ def write_law_scene(
     else:
         wanted = " or ".join(dict.fromkeys((".json", own)))
         raise InputError(path, f"{engine} reads {wanted}", "Give the file that suffix")
+    return content["notes"]
 
 
 def export_scene(
@@ -187,6 +190,9 @@ def _about(engine: str, material: EngineMaterial, about: Mapping[str, Any]) -> d
     grid = about.get("grid")
     fitted = f"fitted on a grid of {grid} cells, whose error they contain"
     notes = [*material.notes, f"constants {'of the material' if grid is None else fitted}", CONTACT]
+    if errors := about.get("fit"):
+        percent = " and after the return map ".join(f"{100 * error:.1f} %" for error in errors.values())
+        notes.insert(0, f"nearest law of {engine}: stress error of the fit over the visited states {percent}")
     keys = ("law", "constants", "density", "scale", "substep", "fit", "scene", "method", "commit")
     return {
         "engine": engine,
