@@ -26,6 +26,7 @@ from neuma_lib.cli import main as neuma
 from neuma_lib.evaluation.text_tables import as_markdown
 from neuma_lib.export.materials import RULES
 from neuma_lib.export.scenes import EngineScene, export_scene
+from neuma_lib.io.files import read_json
 from neuma_lib.io.hdf5 import read_arrays
 
 RHO, SPACING, GRID, SIDE, SECONDS = 1000.0, 0.0125, 40, 12, 0.1
@@ -131,7 +132,7 @@ def drop(folder: Path, engines: list[str]) -> None:
 
 
 def scene(folder: Path, source: str, engines: list[str], count: int = 5) -> None:
-    """Play the scene of a method's folder in each engine that has its law, or a law that is near enough.
+    """Play the scene of a method's folder in each engine, by its law or the nearest one, however far it is.
 
     Writes motions, table.md with distances between the centre and that of the true motion, and silhouettes.png.
     """
@@ -141,11 +142,13 @@ def scene(folder: Path, source: str, engines: list[str], count: int = 5) -> None
     motions = [("true motion", np.array(filmed.truth.frames) * filmed.mpm.dt, filmed.truth.x.numpy(), None)]
     motions.append(("this library", own["frames"] * filmed.mpm.dt, own["x"], None))
     for engine in engines:
-        for options in ([], ["--fit"]):
+        for options in ([], ["--fit"], ["--fit", "--force"]):
             if neuma(["scene", "export", source, str(folder / engine), "--engine", engine, *options]) == 0:
-                motion, name = played(folder / engine), engine + (", nearest law" if options else "")
-                motions.append((name, motion["t"], motion["x"], motion.get("masses")))
                 break
+        motion, about = played(folder / engine), read_json(folder / engine / "scene.json")
+        error = f", stress error {100 * max(about['fit'].values()):.0f} %" if about["fit"] else ""
+        name = f"{engine}, {about['law']['elasticity']['name']}{error}"
+        motions.append((name, motion["t"], motion["x"], motion.get("masses")))
     times, rows, pictures = motions[0][1], [], []
     shown = times[np.linspace(0, len(times) - 1, count).round().astype(int)]
     for name, t, x, m in motions:

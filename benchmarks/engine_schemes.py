@@ -87,6 +87,7 @@ def simulate(
         M = total(W * scene.mass[:, None], index, len(nodes))
         affine = v[:, None] + np.einsum("nij,nkj->nki", C, d)
         start = total((W * scene.mass[:, None])[..., None] * affine, index, len(nodes)) / M
+        start += scene.dt * np.array(scene.gravity)
 
         def stretched(u: np.ndarray, F=F, G=G, index=index) -> np.ndarray:
             L = np.einsum("nki,nkj->nij", u[index], G)
@@ -143,9 +144,8 @@ def to_newton(dt: float) -> None:
     with TemporaryDirectory() as folder:
         export_scene(folder, "newton", scene, spec, {})
         theirs = played(Path(folder))["x"][-1]
-    print(
-        f"  newton: from ours {millimetres(theirs - own)} mm, from its choices here {millimetres(theirs - last)} mm"
-    )
+    apart = millimetres(theirs - last)
+    print(f"  newton: from ours {millimetres(theirs - own)} mm, from its choices here {apart} mm", flush=True)
 
 
 def sand(dt: float = 5e-4) -> None:
