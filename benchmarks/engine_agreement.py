@@ -131,7 +131,7 @@ def drop(folder: Path, engines: list[str]) -> None:
     report(folder, head, rows, pictures)
 
 
-def scene(folder: Path, source: str, engines: list[str], count: int = 5) -> None:
+def scene(folder: Path, source: str, engines: list[str], count: int = 4) -> None:
     """Play the scene of a method's folder in each engine, by its law or the nearest one, however far it is.
 
     Writes motions, table.md with distances between the centre and that of the true motion, and silhouettes.png.
@@ -150,7 +150,7 @@ def scene(folder: Path, source: str, engines: list[str], count: int = 5) -> None
         name = f"{engine}, {about['law']['elasticity']['name']}{error}"
         motions.append((name, motion["t"], motion["x"], motion.get("masses")))
     times, rows, pictures = motions[0][1], [], []
-    shown = times[np.linspace(0, len(times) - 1, count).round().astype(int)]
+    displayed = times[np.linspace(0, len(times) - 1, count).round().astype(int)]
     for name, t, x, m in motions:
         centre = np.average(x, axis=1, weights=m)
         centre = np.stack([np.interp(times, t, centre[:, k]) for k in range(3)], axis=1)
@@ -160,7 +160,7 @@ def scene(folder: Path, source: str, engines: list[str], count: int = 5) -> None
         rows.append(
             [name, f"{distance.mean():.1f}", f"{distance.max():.1f}", f"{1e3 * centre[:, 1].min():.0f}"]
         )
-        nearest = [int(np.abs(t - now).argmin()) for now in shown]
+        nearest = [int(np.abs(t - now).argmin()) for now in displayed]
         pictures.append((name, x[nearest], [f"{t[k]:.3f} s" for k in nearest]))
     report(folder, ["engine", "centre, mean [mm]", "largest [mm]", "lowest centre [mm]"], rows, pictures)
 
@@ -183,7 +183,7 @@ def draw(path: Path, pictures: list[tuple[str, np.ndarray, tuple[str, ...]]]) ->
     grid = figure.subplots(rows, len(pictures), sharex=True, sharey=True, squeeze=False)
     for axes, (name, states, titles) in zip(grid.T, pictures, strict=True):
         for axis, x, title in zip(axes, states, titles, strict=True):
-            axis.scatter(x[:, 0], x[:, 1], s=3, color="tab:blue", linewidths=0)
+            axis.scatter(x[:, 0], x[:, 1], s=6, color="tab:blue", linewidths=0)
             axis.axhline(0, color="k", linewidth=0.8)
             axis.set(aspect="equal", xlim=(low, high), ylim=(-0.03, top), title=f"{name}\n{title}")
             axis.title.set_fontsize(8)

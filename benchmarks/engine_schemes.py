@@ -144,8 +144,8 @@ def to_newton(dt: float) -> None:
     with TemporaryDirectory() as folder:
         export_scene(folder, "newton", scene, spec, {})
         theirs = played(Path(folder))["x"][-1]
-    apart = millimetres(theirs - last)
-    print(f"  newton: from ours {millimetres(theirs - own)} mm, from its choices here {apart} mm", flush=True)
+    rest = millimetres(theirs - last)
+    print(f"  newton: from ours {millimetres(theirs - own)} mm, from its choices here {rest} mm", flush=True)
 
 
 def sand(dt: float = 5e-4) -> None:
