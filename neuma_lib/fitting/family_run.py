@@ -131,11 +131,15 @@ class FamilyRun:
                 self._columns, self._exact = {self._u.tobytes(): similar[0].columns}, False
             self.refine(level, **how)
 
-    def restart_from(self, values: Values) -> None:
-        """Continue from the constants of another family if they have a lower cost."""
-        unknowns = np.append(self.family.unbounded(values) - self._origin, self._u[self._constants :])
-        if self.cost(unknowns) < self.fit.cost:
-            self._u = unknowns
+    def restart_from(self, starts: Sequence[Values]) -> None:
+        """Continue from the best of some constants if it has a lower cost."""
+        deviations = self._u[self._constants :]
+        points = [np.append(self.family.unbounded(start) - self._origin, deviations) for start in starts]
+        residuals = self._simulate(points)
+        costs = [math.inf if residual is None else self._cost(residual) for residual in residuals]
+        best = int(np.argmin(costs))
+        if costs[best] < self.fit.cost:
+            self._u, self._images = points[best], {points[best].tobytes(): residuals[best]}
             self.refine(self._level)
 
     def refine(self, level: int, rough: bool = False, limit: float = math.inf) -> None:

@@ -388,6 +388,21 @@ def test_fits_restart_from_better_ones_that_started_later():
     assert _better_later([stuck, elastic, worse, flow]) == []
 
 
+def test_a_fit_restarts_from_the_best_constants_if_they_are_better():
+    """A flow that starts beyond its yield stress never yields: a local minimum that other limits leave."""
+    body, seen = video_of(PLASTIC, V0, FRAMES)
+    chosen = settings({"plastic": PLASTIC}, covariance_from="elastic", refined_particles=0, iterations=3)
+    video, family = VideoResiduals(MODEL, known(body), body, seen, chosen), Family("plastic", PLASTIC)
+    stuck = family.with_guesses({"yield_stress": 1e6})
+    run = FamilyRun(family, [video], [len(FRAMES)], chosen)
+    run.begin([stuck])
+    before = run.fit.cost
+    run.restart_from([stuck, *family.with_other_limits(stuck, (1, 2))])
+    assert run.fit.cost == before, "no start is better"
+    run.restart_from([stuck, *family.with_other_limits(stuck, (-4, -2))])
+    assert run.fit.cost < 0.5 * before and run.values["yield_stress"] < 1e5
+
+
 def test_a_flow_that_never_yields_shows_the_elastic_body():
     """And one that yields does not, whatever their squared residuals."""
     body, seen = video_of(ELASTIC, V0, FRAMES)
