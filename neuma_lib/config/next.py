@@ -12,7 +12,6 @@ from neuma_lib.config.base import Section, internal
 class NextConfig(Section):
     """Candidates for the next experiment with an object, and what the lab can do."""
 
-    candidates: int = Field(40, ge=1, le=500, description="number of candidates")
     kinds: tuple[Literal["launch", "camera"], ...] = Field(
         ("launch", "camera"),
         min_length=1,
@@ -28,4 +27,5 @@ class NextConfig(Section):
         description="experiment with one body of the material, whose motion shall be predicted as accurately as "
         "possible; null: candidates are ranked by the constants of the material",
     )
+    candidates: int = internal(40, "number of candidates", ge=1, le=500)
     rivals: int = internal(1, "other families to distinguish, those with the lowest scores", ge=0)

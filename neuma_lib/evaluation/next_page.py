@@ -46,6 +46,8 @@ def describe(candidate: Mapping[str, Any]) -> str:
     """What to do, in a few words."""
     own = candidate["settings"]
     if candidate["kind"] == "camera":
+        if abs(own["azimuth"]) == 180:
+            return "film the first launch with a second camera from the opposite side"
         side = f"{abs(own['azimuth']):.0f} degrees to the {'right' if own['azimuth'] > 0 else 'left'} of the first"
         above = f", {own['elevation']:.0f} degrees higher" if own["elevation"] else ""
         return f"film the first launch with a second camera {side}{above}"
@@ -143,7 +145,7 @@ def draw(
 
     Args:
         file: picture to write.
-        motions: body, path and cameras of each. The first camera is shown.
+        motions: body, path and cameras of each. The first camera is used.
         dt: time step [s].
     """
     from matplotlib.figure import Figure
@@ -152,14 +154,16 @@ def draw(
     figure = Figure(figsize=(1.6 * _FRAMES, (1.6 * height / width + 0.3) * len(motions)), dpi=100)
     axes = figure.subplots(len(motions), _FRAMES, squeeze=False)
     for row, (rank, (body, path, cameras)) in zip(axes, enumerate(motions, 1), strict=True):
-        shown = np.linspace(0, len(path.frames) - 1, _FRAMES).round().astype(int).tolist()
+        selected = np.linspace(0, len(path.frames) - 1, _FRAMES).round().astype(int).tolist()
         magnify = max(1, round(_PIXELS / width))
         scale = cameras.Ks.new_tensor([magnify, magnify, 1.0])
         camera = Cameras(
             cameras.viewmats[:1], cameras.Ks[:1] * scale[:, None], width * magnify, height * magnify
         )
-        images = body.particle_gs(camera)(path.x[shown], path.stretch[shown])[:, 0].clamp(0, 1).cpu().numpy()
-        for axis, image, k in zip(row, images, shown, strict=True):
+        images = (
+            body.particle_gs(camera)(path.x[selected], path.stretch[selected])[:, 0].clamp(0, 1).cpu().numpy()
+        )
+        for axis, image, k in zip(row, images, selected, strict=True):
             axis.imshow(image)
             axis.set_title(f"{path.frames[k] * dt:.2f} s", fontsize=7, pad=2)
             axis.set_xticks([])

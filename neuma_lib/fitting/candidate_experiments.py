@@ -21,13 +21,14 @@ from neuma_lib.errors import InputError
 from neuma_lib.sim.model import MPM, contact_clearance
 from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.rigid import moved
-from neuma_lib.splatting.viewpoints import Views, framing
+from neuma_lib.splatting.viewpoints import Views, framing, ring_directions, video_views
 
 _MARGIN = 0.02  # minimum distance of the body from the walls at the start, as of random scenes [m]
 _MOMENTS = 100  # times of a flight at which contact is tested
 _BEFORE = (0.25, 1.5)  # duration of the flight over that after contact: the initial motion must be visible
 _STEPS = 32  # the steps of a video are a multiple of this, so that its frames are evenly spaced
 _DRAWS = 50  # per candidate
+_VIEWS = 5  # of the ring of a rendered scene, without the first
 _AZIMUTHS, _ELEVATIONS = (45, 90, 135, -90), (0, 40)  # of a second camera from the first [degrees]
 FLAWS = {
     "outside": "start outside the box",
@@ -198,27 +199,40 @@ def _rounded(value: float) -> float:
     return float(f"{value:.3g}")
 
 
-def second_cameras(cameras: Cameras, points: np.ndarray) -> list[tuple[dict[str, float], Cameras]]:
+def second_cameras(
+    cameras: Cameras, points: np.ndarray, rendered: bool
+) -> list[tuple[dict[str, float], Cameras]]:
     """Places of a second camera that sees the same motion as the first one, with its image size.
 
     Args:
         cameras: of the existing video.
         points: positions of the body over all frames [m], shape (n, 3).
+        rendered: whether the camera is one of the ring of a rendered scene (`viewpoints.ring_directions`), which has a
+            number, ``view``.
 
     Returns:
         Azimuth and elevation from the line of sight of the first camera [degrees], and the camera.
     """
-    found = []
     back = -cameras.viewmats[0, 2, :3].double().cpu().numpy()
     start, rise = math.atan2(back[0], back[2]), math.asin(float(np.clip(back[1], -1, 1)))
+    options: list[tuple[dict[str, float], Cameras]] = []
+    if rendered:
+        for view in range(1, 1 + _VIEWS):
+            views = video_views(points, view + 1, cameras.width, cameras.height)
+            x, y, z = ring_directions(view + 1)[view]
+            azimuth = (math.degrees(math.atan2(x, z) - start) + 180) % 360 - 180
+            place = {"view": view, "azimuth": azimuth, "elevation": math.degrees(math.asin(y) - rise)}
+            own = as_cameras(views, cameras)[view]
+            options.append(({key: round(value) for key, value in place.items()}, own))
+        return options
     for elevation in _ELEVATIONS:
         for azimuth in _AZIMUTHS:
             at = start + math.radians(azimuth)
             up = min(rise + math.radians(elevation), math.radians(80))
             towards = [math.cos(up) * math.sin(at), math.sin(up), math.cos(up) * math.cos(at)]
             views = framing(np.array([towards]), points, cameras.width, cameras.height)
-            found.append(({"azimuth": azimuth, "elevation": elevation}, as_cameras(views, cameras)))
-    return found
+            options.append(({"azimuth": azimuth, "elevation": elevation}, as_cameras(views, cameras)))
+    return options
 
 
 def as_cameras(views: Views, like: Cameras) -> Cameras:

@@ -52,7 +52,7 @@ class Option:
         kind: launch or camera.
         settings: of its scene, or of the camera.
         forecast: its expected result.
-        after: what is ranked, after the experiment (`Choice.goal`); smaller is better.
+        after: what is ranked, after the experiment (`Selection.goal`); smaller is better.
         prediction: expected standard deviation of the chosen motion [m], or None.
         body, path, cameras: its motion with the identified constants, and what would film it.
     """
@@ -68,7 +68,7 @@ class Option:
 
 
 @dataclass(frozen=True)
-class Choice:
+class Selection:
     """Options for the next experiment, the best first.
 
     Attributes:
@@ -180,7 +180,7 @@ def choose_next(
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
     log: Callable[[str], None] = lambda text: None,
-) -> Choice:
+) -> Selection:
     """Rank candidates for the next experiment.
 
     Args:
@@ -191,8 +191,8 @@ def choose_next(
         rivals: other families to distinguish, with constants to start from.
         ties: whether a rival predicts equally well, so that families are still to be distinguished.
         derivatives: of the motion to predict, see `motion_derivatives`, or None.
-        reframe: whether the cameras are placed again so that they see the whole motion, as in a rendered scene. They
-            are fixed otherwise.
+        reframe: whether the cameras are those of a rendered scene, which are placed so that they see the whole motion.
+            They are fixed otherwise.
         turn: whether the body may start in other orientations.
         seed: of the candidates.
         progress: called with (finished candidates, their number).
@@ -242,7 +242,7 @@ def choose_next(
     if not options:
         raise NonFiniteError("next", f"all {failed} candidates diverge with the identified constants")
     options.sort(key=lambda option: (option.after, -min(option.forecast.evidence.values(), default=0.0)))
-    return Choice(goal, before, fit, prediction, options, failed, settings)
+    return Selection(goal, before, fit, prediction, options, failed, settings)
 
 
 def _candidates(
@@ -251,15 +251,15 @@ def _candidates(
     """Kind, settings, experiment and motion of each candidate; no experiment where the motion diverges."""
     frames = joint_frames(first.video)
     cameras = first.video[0].cameras
-    found: list[tuple[str, dict[str, Any], Experiment | None, Trajectory | None]] = []
+    candidates: list[tuple[str, dict[str, Any], Experiment | None, Trajectory | None]] = []
     if "camera" in lab.kinds:
         (path,) = _motions(known, first.model, [(first.body, first.motion, frames)])
         points = path.x.flatten(0, 1).cpu().numpy() if path else np.zeros((1, 3))
-        for place, camera in second_cameras(cameras[0], points)[: lab.candidates]:
+        for place, camera in second_cameras(cameras[0], points, reframe)[: lab.candidates]:
             video = [*first.video, unfilmed(frames, camera)]
-            found.append(("camera", dict(place), path and replace(first, video=video), path))
-    if "launch" in lab.kinds and len(found) < lab.candidates:
-        count = lab.candidates - len(found)
+            candidates.append(("camera", dict(place), path and replace(first, video=video), path))
+    if "launch" in lab.kinds and len(candidates) < lab.candidates:
+        count = lab.candidates - len(candidates)
         launches = draw_launches(first.model, first.body, first.motion, frames[-1], lab, count, seed, turn)
         spaced = [
             tuple(round(k * launch.steps / (len(frames) - 1)) for k in range(len(frames)))
@@ -274,8 +274,8 @@ def _candidates(
                 )
                 seen = as_cameras(views, cameras)
             experiment = Experiment(first.model, launch.motion, launch.body, [unfilmed(own, seen)])
-            found.append(("launch", launch.settings, experiment if path else None, path))
-    return found
+            candidates.append(("launch", launch.settings, experiment if path else None, path))
+    return candidates
 
 
 @torch.no_grad()

@@ -1,4 +1,4 @@
-"""What an experiment is expected to tell, against what fits of it report; limits of the lab; refusals."""
+"""Expected results of experiments, against what fits of it report; limits of the lab; refusals."""
 
 import math
 from dataclasses import replace
@@ -96,7 +96,7 @@ def log_stds(fit: FamilyFit) -> np.ndarray:
 
 @pytest.mark.parametrize("v0", [(0.2, -2.5, 0.3), (0.0, -0.5, 0.0)])
 def test_predicted_deviations_are_those_that_a_joint_fit_reports(alone, known, v0):
-    """A fast launch and a slow one that tells little. The jackknife over the few blocks that show the ball has a
+    """A fast launch and a slow one with little information. The jackknife over the few blocks that show the ball has a
     relative error of about 1 / sqrt(2 * 8) for a deviation; twice the ratio of two of them is a factor of 2."""
     forecast = known.forecast(experiment(v0))
     both = identify(MODEL, *video(V0, 5), settings(), other_videos=[video(v0, 6)])
@@ -106,7 +106,7 @@ def test_predicted_deviations_are_those_that_a_joint_fit_reports(alone, known, v
     assert (log_stds(forecast.fit) <= log_stds(alone.best)).all()
 
 
-def test_a_faster_launch_tells_more_and_a_flight_tells_nothing(known):
+def test_a_faster_launch_has_more_information_and_a_flight_none(known):
     slow, fast = (known.forecast(experiment(v0)) for v0 in ((0.0, -0.5, 0.0), (0.2, -2.5, 0.3)))
     assert spread(fast.fit, settings()) < spread(slow.fit, settings())
     flying = known.forecast(experiment((0.0, 1.0, 0.0), frames=(0, 8, 16, 24)))
@@ -114,7 +114,7 @@ def test_a_faster_launch_tells_more_and_a_flight_tells_nothing(known):
     assert flying.fit.covariance == pytest.approx(known.fit.covariance, rel=1e-6)
 
 
-def test_a_certain_motion_tells_more(known):
+def test_a_certain_motion_has_more_information(known):
     """The information with an exact initial motion exceeds that with an uncertain one in every direction."""
     unsure, sure = (
         known.forecast(experiment((0.2, -2.5, 0.3), std)).information for std in (STD, (0.0,) * 6)
@@ -270,9 +270,9 @@ def test_a_turned_body_is_the_same_body():
 def test_second_cameras_see_the_motion_from_elsewhere():
     points = ball(0.3).x0.numpy()
     first = camera()
-    cameras = second_cameras(first, points)
-    assert len(cameras) == 8
-    for _, own in cameras:
+    fixed, rendered = (second_cameras(first, points, kind) for kind in (False, True))
+    assert len(fixed) == 8 and [place["view"] for place, _ in rendered] == [1, 2, 3, 4, 5]
+    for _, own in [*fixed, *rendered]:
         pixels, depth = own.project(torch.from_numpy(points))
         assert (pixels > 0).all() and (pixels < own.width).all() and (depth > 0).all()
         assert float(own.viewmats[0, 2, :3] @ first.viewmats[0, 2, :3]) < 0.99
