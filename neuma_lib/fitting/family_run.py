@@ -23,6 +23,7 @@ from neuma_lib.fitting.least_squares import (
     Linearisation,
     block_sums,
     jackknife,
+    laplace,
     levenberg_marquardt,
     secant_update,
 )
@@ -223,6 +224,7 @@ class FamilyRun:
             k = self._constants
             covariance = self._covariance()
             result.covariance, stds = covariance[:k, :k], np.sqrt(np.diag(covariance))
+            result.laplace = laplace(self.fit, self._spreads)[:k, :k]
             result.motions = tuple(self._motion(v, stds) for v in range(len(self.videos)))
             if any(count < len(video.frames) for count, video in zip(self.counts, self.videos, strict=True)):
                 result.held_out = self._held_out()

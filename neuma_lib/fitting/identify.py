@@ -193,6 +193,7 @@ def identify(
         model.grid,
         settings,
         material,
+        [fit.family.name for fit in compared.values() if math.isfinite(fit.score)],
     )
 
 
