@@ -131,7 +131,9 @@ class Hexahedra:
     def node_volumes(self) -> Array:
         """Integrals of the shape functions [m^3], shape (N,). They sum to the volume."""
         parts = np.einsum("eq,qa->ea", self.full.weights, self.full.values)
-        return np.bincount(self.cells.ravel(), parts.ravel(), len(self.nodes))
+        result = np.zeros(len(self.nodes))
+        np.add.at(result, self.cells, parts)
+        return result
 
     def surface(self, length: float) -> tuple[csr_matrix, NDArray[np.int64]]:
         """The outer surface as triangles.
