@@ -214,16 +214,17 @@ class StillResiduals:
         pixels = self.surface(u)[1]
         edge, segment, _, _ = self._distances(pixels)
         visible = ~self.body.hidden_points[edge.vertices[segment]].any(axis=1)
-        behind = binary_dilation(self.hidden(pixels), iterations=_HIDDEN_MARGIN)
+        behind = self.hidden(pixels, _HIDDEN_MARGIN)
         columns, rows = np.floor(self.contour).astype(int).T
         visible &= ~behind[rows.clip(0, len(behind) - 1), columns.clip(0, behind.shape[1] - 1)]
         changed, self.visible = bool((visible != self.visible).any()), visible
         return changed
 
-    def hidden(self, pixels: Array) -> NDArray[np.bool_]:
-        """Pixels (H, W) of the hidden parts of the body."""
+    def hidden(self, pixels: Array, margin: int) -> NDArray[np.bool_]:
+        """Pixels (H, W) of the hidden parts of the body, with a margin [px]."""
         inside = self.body.hidden_points[self.body.triangles].all(axis=1)
-        return silhouette(pixels, self.body.triangles[inside], *self.still.mask.shape)
+        mask = silhouette(pixels, self.body.triangles[inside], *self.still.mask.shape)
+        return np.asarray(binary_dilation(mask, iterations=margin), dtype=bool)
 
     def distances(self, u: Array) -> Array:
         """Distances (C,) of all points of the observed silhouette from the outline [px]."""
@@ -277,15 +278,15 @@ class StillResiduals:
         corner, J_corner = self._corners(u)
         return np.concatenate([kept * root, corner]), np.concatenate([(kept * slope)[:, None] * J, J_corner])
 
-    def cost(self, u: Array) -> float:
+    def cost(self, unknowns: Array) -> float:
         try:
-            residual = self._evaluate(u)[0]
+            residual = self._evaluate(unknowns)[0]
         except NonFiniteError:
             return math.inf
         return float(residual @ residual)
 
-    def linearise(self, u: Array, free: Sequence[int], exact: bool = True) -> Linearisation:
-        residual, J = self._evaluate(u)
+    def linearise(self, unknowns: Array, free: Sequence[int], exact: bool = True) -> Linearisation:
+        residual, J = self._evaluate(unknowns)
         J[:, np.setdiff1d(np.arange(10), free)] = 0
         rms = float(np.sqrt((residual**2).mean()))
         return Linearisation((J.T @ J)[None], (J.T @ residual)[None], float(residual @ residual), rms)
@@ -324,24 +325,27 @@ def fit_still(
         InputError: the mask is empty.
         NonFiniteError: no pose leads to a finite fit.
     """
-    best: tuple[float, StillResiduals, Array, Linearisation] | None = None
+    free = [k for k in range(10) if k != RATIO or not fixed_ratio]
+    fits: list[tuple[StillResiduals, Array, Linearisation]] = []
     for pose in poses:
         residuals = StillResiduals(still, body, pose, placement, placement_std, ratio)
-        free = [k for k in range(10) if k != RATIO or not fixed_ratio]
-        u = np.zeros(10)
-        if not math.isfinite(residuals.cost(u)):
-            continue
-        for _ in range(_ROUNDS):
-            changed = residuals.choose_visible(u)
-            if not changed and u.any():
-                break
-            u, fit, _ = levenberg_marquardt(residuals, u, free, _prior, 1e-5, iterations, longest=_MAX_STEP)
-        cost = fit.cost + u @ _prior(fit) @ u
-        if best is None or cost < best[0]:
-            best = cost, residuals, u, fit
-    if best is None:
+        if math.isfinite(residuals.cost(np.zeros(10))):
+            fits.append((residuals, *_minimise(residuals, free, iterations)))
+    if not fits:
         raise NonFiniteError("still", "no initial pose shows the body in front of the camera")
-    return _result(*best, free)
+    costs = [float(fit.cost + u @ _prior(fit) @ u) for _, u, fit in fits]
+    best = int(np.argmin(costs))
+    return _result(free, costs[best], *fits[best])
+
+
+def _minimise(residuals: StillResiduals, free: Sequence[int], iterations: int) -> tuple[Array, Linearisation]:
+    """Unknowns and the problem linearised there, with the points of the silhouette that are visible there."""
+    u: Array = np.zeros(10)
+    for attempt in range(_ROUNDS):
+        if not residuals.choose_visible(u) and attempt:
+            break
+        u, _, _ = levenberg_marquardt(residuals, u, free, _prior, 1e-5, iterations, longest=_MAX_STEP)
+    return u, residuals.linearise(u, free)
 
 
 def _prior(fit: Linearisation) -> Array:
@@ -352,7 +356,7 @@ def _prior(fit: Linearisation) -> Array:
 
 
 def _result(
-    cost: float, residuals: StillResiduals, u: Array, fit: Linearisation, free: Sequence[int]
+    free: Sequence[int], cost: float, residuals: StillResiduals, u: Array, fit: Linearisation
 ) -> StillFit:
     still, body = residuals.still, residuals.body
     pose, placement, ratio = residuals.values(u)
@@ -367,12 +371,12 @@ def _result(
     _, pixels, _ = residuals.surface(u)
     height, width = still.mask.shape
     predicted = silhouette(pixels, body.triangles, height, width)
-    hidden = binary_dilation(residuals.hidden(pixels), iterations=_HIDDEN_MARGIN)
+    hidden = residuals.hidden(pixels, _HIDDEN_MARGIN)
     compared = ~hidden
     union = ((predicted | still.mask) & compared).sum()
     iou = ((predicted & still.mask) & compared).sum() / max(1, union)
     return StillFit(
         pose, placement, ratio, float(std[RATIO]), std[PLACEMENT],
-        float(np.sqrt((distance**2).mean())), float(np.sqrt((corners**2).mean() * 2)), float(iou), float(cost),
+        float(np.sqrt((distance**2).mean())), float(np.sqrt((corners**2).mean() * 2)), float(iou), cost,
         predicted, hidden,
     )  # fmt: skip
