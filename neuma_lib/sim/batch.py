@@ -56,7 +56,8 @@ def rollout_batch(
     """
     frames = checked_frames(frames, steps)
     starts = [start] * len(laws) if isinstance(start, State) else list(start)
-    if not laws or len(starts) != len(laws) or len({len(state.x) for state in starts}) > 1:
+    alike = len({(len(state.x), state.bodies) for state in starts}) == 1
+    if not laws or len(starts) != len(laws) or not alike:
         raise InputError(
             "laws",
             f"{len(laws)} laws do not match initial states of {[len(state.x) for state in starts]} particles",
@@ -111,7 +112,16 @@ def _side_by_side(
     state = State.joined(starts) if copies > 1 else starts[0]
     try:
         path, errors = fly_and_simulate(
-            model, tuple(regions), state, frames, None, total, skip_free_flight, copies, frictions=frictions
+            model,
+            tuple(regions),
+            state,
+            frames,
+            None,
+            total,
+            skip_free_flight,
+            copies,
+            frictions=frictions,
+            bodies=starts[0].bodies,
         )
     except NonFiniteError as error:
         if copies > 1 and error.step is None:  # from the code of a law, which does not state the copy
