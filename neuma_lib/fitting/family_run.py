@@ -22,6 +22,7 @@ from neuma_lib.fitting.least_squares import (
     Linearisation,
     block_sums,
     jackknife,
+    laplace,
     levenberg_marquardt,
     secant_update,
 )
@@ -130,11 +131,15 @@ class FamilyRun:
                 self._columns, self._exact = {self._u.tobytes(): similar[0].columns}, False
             self.refine(level, **how)
 
-    def restart_from(self, values: Values) -> None:
-        """Continue from the constants of another family if they have a lower cost."""
-        unknowns = np.append(self.family.unbounded(values) - self._origin, self._u[self._constants :])
-        if self.cost(unknowns) < self.fit.cost:
-            self._u = unknowns
+    def restart_from(self, starts: Sequence[Values]) -> None:
+        """Continue from the best of some constants if it has a lower cost."""
+        deviations = self._u[self._constants :]
+        points = [np.append(self.family.unbounded(start) - self._origin, deviations) for start in starts]
+        residuals = self._simulate(points)
+        costs = [math.inf if residual is None else self._cost(residual) for residual in residuals]
+        best = int(np.argmin(costs))
+        if costs[best] < self.fit.cost:
+            self._u, self._images = points[best], {points[best].tobytes(): residuals[best]}
             self.refine(self._level)
 
     def refine(self, level: int, rough: bool = False, limit: float = math.inf) -> None:
@@ -187,6 +192,7 @@ class FamilyRun:
             k = self._constants
             covariance = self._covariance()
             result.covariance, stds = covariance[:k, :k], np.sqrt(np.diag(covariance))
+            result.laplace = laplace(self.fit, self._spreads)[:k, :k]
             result.motions = tuple(self._motion(v, stds) for v in range(len(self.videos)))
             if any(count < len(video.frames) for count, video in zip(self.counts, self.videos, strict=True)):
                 result.held_out = self._held_out()

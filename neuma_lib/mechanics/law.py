@@ -14,13 +14,16 @@ from collections.abc import Hashable, Mapping
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
 
 from neuma_lib.errors import NonFiniteError
-from neuma_lib.mechanics.catalogue import register
+from neuma_lib.mechanics.catalogue import register, viscous_stiffness
+
+if TYPE_CHECKING:
+    from neuma_lib.mechanics.viscosity import Viscosity
 
 Weights = tuple[Tensor, ...]
 AdjointPrecision = Literal["single", "half"]
@@ -172,28 +175,37 @@ class Plasticity(Constitutive):
 
 
 class Law(nn.Module):
-    """A material model: elasticity and plasticity, with a name for messages.
+    """A material model: elasticity and plasticity, with a name for messages, and optionally a viscous part.
 
     Attributes:
+        viscosity: spring and dashpot parallel to the elasticity (`neuma_lib.mechanics.viscosity`), or None.
         grid: cells along the unit cube of the simulation that it was learned in, whose discretisation error it has
             absorbed; None if it does not depend on a grid. Simulations on another grid warn.
     """
 
     grid: int | None = None
 
-    def __init__(self, elasticity: Elasticity, plasticity: Plasticity, name: str = "law"):
+    def __init__(
+        self,
+        elasticity: Elasticity,
+        plasticity: Plasticity,
+        name: str = "law",
+        viscosity: Viscosity | None = None,
+    ):
         super().__init__()
         self.elasticity = elasticity
         self.plasticity = plasticity
         self.name = name
+        self.viscosity = viscosity
 
     @classmethod
     def from_spec(cls, spec: Mapping[str, Any], dt: float | None = None) -> Law:
         """An analytic law from the names and constants of its parts (`analytic_law`).
 
         Args:
-            spec: ``elasticity`` and optionally ``plasticity``, each with its ``name`` and constants in SI units.
-            dt: time step of the simulation [s], required by rate-dependent plasticity.
+            spec: ``elasticity`` and optionally ``plasticity`` and ``viscosity``, each with its ``name`` and constants
+                in SI units.
+            dt: time step of the simulation [s], required by rate-dependent parts.
 
         Raises:
             InputError: a part, name or constant is unknown or missing, or a constant is out of bounds.
@@ -228,7 +240,8 @@ class Law(nn.Module):
         _imported("io.laws").save_law(path, self, _imported("io.exported").about_law(self, **known))
 
     def kirchhoff(self, F: Tensor) -> Tensor:
-        """Kirchhoff stress tau [Pa] of trial deformation gradients after the return map, both (N, 3, 3).
+        """Kirchhoff stress tau [Pa] of trial deformation gradients after the return map, both (N, 3, 3). The viscous
+        part, which depends on the past, adds nothing.
 
         Differentiable in F and the weights, in the precision of F, as a module of other solvers.
         """
@@ -282,8 +295,15 @@ class Law(nn.Module):
         return float(torch.linalg.eigvalsh(0.5 * (Q + Q.mT)).max())
 
     def wave_speed(self, rho: float) -> float:
-        """Largest speed of small elastic waves at F = I [m/s], for density rho [kg/m^3]."""
-        return max(self.longitudinal_modulus(), 0.0) ** 0.5 / rho**0.5
+        """Largest speed of small elastic waves at F = I [m/s], for density rho [kg/m^3].
+
+        With a viscous part, that of an elastic law with the same limit of the time step
+        (`catalogue.viscous_stiffness`).
+        """
+        modulus = max(self.longitudinal_modulus(), 0.0)
+        if self.viscosity is not None:
+            modulus += viscous_stiffness({key: float(v) for key, v in self.viscosity.values.items()})
+        return modulus**0.5 / rho**0.5
 
 
 def _imported(module: str) -> ModuleType:

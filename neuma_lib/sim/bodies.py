@@ -12,6 +12,8 @@ from neuma_lib.errors import InputError
 
 MAX_BODIES = 5
 """Bodies of a simulation."""
+MAX_RANGES = 2 * MAX_BODIES
+"""Ranges of particles that belong to one body: that of each body, and that of its viscous branches."""
 
 
 @dataclass(frozen=True)
@@ -43,8 +45,8 @@ def pair_table(
 ) -> np.ndarray:
     """Constants of B bodies for the kernels, shape (B, B + 1).
 
-    The first B columns are the frictions of all pairs, at most ``largest``, by default that of `Pair`. The last column is
-    the volume fraction of a node per mass [1/kg].
+    The first B columns are the frictions of all pairs, at most ``largest``, by default that of `Pair`. The last is the
+    volume fraction of a node per mass [1/kg].
 
     Args:
         frictions: Coulomb coefficients of the given pairs, in place of their own.

@@ -2,8 +2,8 @@
 
 Each body has its own nodes (Bardenhagen et al. 2000). At a node, body a has the mass m_a and the velocity v_a. With the
 mean f_a of its volume fraction over 27 nodes (weights 1/4, 1/2, 1/4 along an axis) and its gradient g_a by central
-differences [1/dx], h_a = |g_a| / f_a tells the depth of the node in the body, also next to its edges: h is 0 deep inside,
-about 1 at a plane surface, and 2 where the body ends. For a pair with the unit normal n, which points out of b,
+differences [1/dx], h_a = |g_a| / f_a tells the depth of the node in the body, also next to its edges: h is 0 deep
+inside, about 1 at a plane surface, and 2 where the body ends. For a pair with the unit normal n, which points out of b,
 
     gap = (g_a . n / f_a - g_b . n / f_b - 2) dx
 
@@ -14,8 +14,8 @@ function of log |g_a| / |g_b| + gap_a - gap_b joins both without a jump. With v 
     v_a += s (m_b / M) (p n - q),   v_b -= s (m_a / M) (p n - q),   M = sum of the masses of all bodies at the node
 
 This is the impact of a Coulomb friction without rebound. Bodies rebound by their elasticity. s grows from 0 at a gap of
-`REACH` to 1 where they touch, and with f_a f_b / (f_a + f_b) up to `COMMON`, since the gap is uncertain where one body is
-scarce. Momentum is conserved. Bodies that part are free.
+`REACH` to 1 where they touch, and with f_a f_b / (f_a + f_b) up to `COMMON`, since the gap is uncertain where one body
+is scarce. Momentum is conserved. Bodies that part are free.
 """
 
 # No `from __future__ import annotations` here: Warp reads the annotations of functions as objects.
@@ -26,7 +26,6 @@ import torch
 import warp as wp
 
 from neuma_lib.device import start_warp
-from neuma_lib.sim.colliders import CONTACT_STIFFNESS
 
 start_warp()
 
@@ -46,9 +45,9 @@ def body_functions(dtype: torch.dtype, GridConstants: type) -> SimpleNamespace:
 
     - ``change(c, pairs, grid, node)``: change of the velocity of a node by contact. ``pairs`` has a `bodies.pair_table`
       for each copy, shape (copies B, B + 1).
-    - ``adjoint(c, pairs, grid, grad_grid, node, grad_before, grad_around)``: from the gradients of the velocities of all
-      bodies after contact, sets those of the velocity before contact and of the mass at the node (grad_before), and of
-      the gradient and mean of masses around it (grad_around).
+    - ``adjoint(c, pairs, grid, grad_grid, node, grad_before, grad_around)``: from the gradients of the velocities of
+      all bodies after contact, sets those of the velocity before contact and of the mass at the node (grad_before), and
+      of the gradient and mean of masses around it (grad_around).
     - ``mass_gradient(c, node, grad_before, grad_around)``: gradient of the mass of a node from those of all nodes.
     """
     real = {torch.float32: wp.float32, torch.float64: wp.float64}[dtype]
@@ -105,9 +104,9 @@ def body_functions(dtype: torch.dtype, GridConstants: type) -> SimpleNamespace:
     def next_to(c: GridConstants, node: wp.int32, k: wp.int32):
         """Neighbour k of 27 of a node, of which 13 is itself, or -1 at the end of the grid."""
         last, place = c.n - 1, node % (c.n * c.n * c.n)
-        i, j, l = place / (c.n * c.n) + k / 9 - 1, place / c.n % c.n + k / 3 % 3 - 1, place % c.n + k % 3 - 1
-        inside = wp.min(i, wp.min(j, l)) >= 0 and wp.max(i, wp.max(j, l)) <= last
-        return wp.where(inside, node - place + (i * c.n + j) * c.n + l, -1)
+        x, y, z = place / (c.n * c.n) + k / 9 - 1, place / c.n % c.n + k / 3 % 3 - 1, place % c.n + k % 3 - 1
+        inside = wp.min(x, wp.min(y, z)) >= 0 and wp.max(x, wp.max(y, z)) <= last
+        return wp.where(inside, node - place + (x * c.n + y) * c.n + z, -1)
 
     @wp.func
     def filter(k: wp.int32):

@@ -25,7 +25,7 @@ import torch
 import warp as wp
 
 from neuma_lib.device import start_warp
-from neuma_lib.sim.bodies import MAX_BODIES
+from neuma_lib.sim.bodies import MAX_RANGES
 from neuma_lib.sim.body_contact import body_functions
 from neuma_lib.sim.clamp_kernels import clamp_functions, hold_type
 from neuma_lib.sim.clamps import HELD_SHARE
@@ -56,7 +56,8 @@ def warp_types(dtype: torch.dtype) -> SimpleNamespace:
         mat33=wp.types.matrix(shape=(3, 3), dtype=real),
         mat34=wp.types.matrix(shape=(3, 4), dtype=real),
         walls=wp.types.vector(length=6, dtype=wp.int32),
-        starts=wp.types.vector(length=MAX_BODIES + 1, dtype=wp.int32),
+        starts=wp.types.vector(length=MAX_RANGES + 1, dtype=wp.int32),
+        body_of=wp.types.vector(length=MAX_RANGES, dtype=wp.int32),
     )
 
     @wp.struct
@@ -66,7 +67,9 @@ def warp_types(dtype: torch.dtype) -> SimpleNamespace:
         copies: wp.int32
         bodies: wp.int32  # per copy
         fields: wp.int32  # grids, one of each body of each copy
-        starts: types.starts  # first particle of each body in its copy, and the end of the last
+        ranges: wp.int32  # of particles of a copy that belong to one body
+        starts: types.starts  # first particle of each range in its copy, and the end of the last
+        body_of: types.body_of  # body of each range
         wall_nodes: wp.int32  # thickness of a wall
         faces: wp.int32  # first obstacles that are faces of the unit cube
         walls: types.walls  # condition on x_min, x_max, y_min, y_max, z_min, z_max
@@ -110,9 +113,11 @@ def grid_functions(dtype: torch.dtype) -> SimpleNamespace:
         if c.bodies > 1:
             q = p - field * c.particles
             field = field * c.bodies
-            for body in range(1, c.bodies):
-                if q >= c.starts[body]:
-                    field += 1
+            own = wp.int32(0)
+            for k in range(1, c.ranges):
+                if q >= c.starts[k]:
+                    own = k
+            field += c.body_of[own]
         return field
 
     @wp.func

@@ -59,7 +59,7 @@ class MPM:
         wall_cells: thickness of released walls [nodes].
         colliders: obstacles in the cube, for contact of particles only.
         clamps: regions whose particles follow a prescribed motion.
-        pairs: constants of the contact of bodies (`State.bodies`). Pairs that are not given have the defaults of `Pair`.
+        pairs: constants of the contact of bodies (`State.bodies`). Pairs that are not given have those of `Pair`.
 
     Raises:
         InputError: a value is out of range or unknown.

@@ -40,9 +40,9 @@ class NativeTransfers:
         self._ws = weakref.proxy(ws)  # which owns this object
         self._kernels = transfer_kernels(size.dtype, ws.features)
         self._deformation = deformation_kernels(size.dtype)
-        gradients = (3 if size.bodies else 1) if size.differentiable else 0
+        gradients = (3 if size.ranges else 1) if size.differentiable else 0
         self.grids = ws.buffer((2 + gradients, size.fields * model.nodes**3 + PADDING), "vec4")
-        of_contact = self.grids[3:] if size.differentiable and size.bodies else self.grids[:2]
+        of_contact = self.grids[3:] if size.differentiable and size.ranges else self.grids[:2]
         self.grad_before, self.grad_around = of_contact  # unused by one body
         for unpadded in (self.grad_before, self.grad_around):
             ws.add_view(unpadded, "vec4")
@@ -127,7 +127,7 @@ class NativeTransfers:
         launches = [self._launch(self._deformation.total_adjoint, N)] if ws.size.total else []
         launches.append(self._launch(k.g2p_adjoint, **trial))
         launches += [self._launch(k.held_adjoint, N, **trial)] if "clamps" in ws.features else []
-        launches += [self._launch(k.body_contact_adjoint)] if ws.size.bodies else []
+        launches += [self._launch(k.body_contact_adjoint)] if ws.size.ranges else []
         launches += [self._launch(k.grid_adjoint), self._launch(k.p2g_adjoint)]
         launches += [self._launch(k.touch_adjoint)] if "contact" in ws.features else []
         return launches

@@ -17,6 +17,7 @@ from torch.autograd.function import once_differentiable
 
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.mechanics.law import Law
+from neuma_lib.sim.branches import branched, merged
 from neuma_lib.sim.free_flight import ballistic, free_flight_steps
 from neuma_lib.sim.memory import DEFAULT_CACHE_BYTES, plan_memory
 from neuma_lib.sim.model import MPM, MaterialRegion, as_regions
@@ -79,11 +80,7 @@ def rollout(
         given = f"shape {tuple(tracers.shape)} as {tracers.dtype}"
         raise InputError("tracers", f"{given} must be (M, 3) as {state.x.dtype}")
 
-    if state.bodies and (model.contact != "particles" or model.clamps):
-        given = "clamps" if model.clamps else f"contact of {model.contact}"
-        raise InputError("state.bodies", f"several bodies exclude {given}", "Use contact of particles, no clamps")
-    if any(pair.second >= max(1, len(state.bodies)) for pair in model.pairs):
-        raise InputError("pairs", f"have a body that is none of the {max(1, len(state.bodies))} of the state")
+    check_bodies(model, state)
     if tracers is not None and state.bodies and sum(tracer_bodies) != len(tracers):
         raise InputError(
             "tracer_bodies",
@@ -189,6 +186,22 @@ def fly_and_simulate(
     Returns one error per copy, or None. The states of a copy with an error are undefined. If all copies have one, the
     first is raised.
     """
+    count, both = len(state.x), branched(regions, state)
+    if both:
+        if copies > 1:
+            raise InputError(
+                "laws", "those with a viscous part share no launches", "Simulate them one by one"
+            )
+        regions, state, owners = both
+    ranges = tuple((size, body) for body, size in enumerate(bodies))
+    if both and bodies:  # branches belong to the bodies of their particles, in the same order
+        ends = torch.tensor(bodies).cumsum(0)
+        of_body = torch.bincount(torch.searchsorted(ends, owners.cpu(), right=True), minlength=len(bodies))
+        ranges += tuple((size, body) for body, size in enumerate(of_body.tolist()) if size)
+
+    def of_laws(path: Trajectory) -> Trajectory:
+        return merged(path, owners, count) if both else path
+
     for region in regions:
         for part in (region.law.elasticity, region.law.plasticity):
             for own in getattr(part, "parts", (part,)):
@@ -203,7 +216,7 @@ def fly_and_simulate(
     flight = ballistic(model, start, tuple(more), tracers, frames[:in_flight]) if in_flight else None
     frames = frames[in_flight:]
     if flight is not None and not frames:
-        return flight, [None] * copies
+        return of_laws(flight), [None] * copies
     if first:
         landed = ballistic(model, start, tuple(more), tracers, (first,))
         start = (landed.x[0], landed.v[0], *start[2:])
@@ -229,12 +242,12 @@ def fly_and_simulate(
             bool(bodies),
         )
     simulation = Simulation(
-        model, regions, slices, state, steps, first, plan, scatter, total, copies, frictions, bodies
+        model, regions, slices, state, steps, first, plan, scatter, total, copies, frictions, ranges
     )
     passive = None if tracers is None else (tracers, tracer_bodies)
     *states, seen = RolloutFunction.apply(simulation, [n - first for n in frames], passive, *inputs)
     path = Trajectory(frames, *states[:4], tracers=seen, **dict(zip(more, states[4:], strict=True)))
-    return path if flight is None else flight.followed_by(path), simulation.errors
+    return of_laws(path if flight is None else flight.followed_by(path)), simulation.errors
 
 
 class RolloutFunction(torch.autograd.Function):
@@ -268,6 +281,18 @@ def checked_frames(frames: Sequence[int], steps: int) -> tuple[int, ...]:
     if frames[-1] > steps:
         raise InputError("frames", f"the last frame, {frames[-1]}, must not exceed the {steps} steps")
     return frames
+
+
+def check_bodies(model: MPM, state: State) -> None:
+    """Raise InputError unless the bodies of a state can touch each other and the pairs of the model are among them."""
+    if state.bodies and (model.contact != "particles" or model.clamps):
+        given = "clamps" if model.clamps else f"contact of {model.contact}"
+        raise InputError(
+            "state.bodies", f"several bodies exclude {given}", "Use contact of particles, no clamps"
+        )
+    count = max(1, len(state.bodies))
+    if any(pair.second >= count for pair in model.pairs):
+        raise InputError("pairs", f"name a body that is none of the {count} of the state")
 
 
 def check_inside(model: MPM, x0: Tensor) -> None:

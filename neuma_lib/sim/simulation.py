@@ -61,7 +61,7 @@ class Simulation:
         total: whether the state includes the total deformation.
         copies: number of independent simulations in the state that share launches, see `kernels`.
         frictions: `MPM.frictions` of each copy. None: those of the model.
-        bodies: number of particles of each body of a copy, if there are several.
+        ranges: consecutive ranges of a copy, with their numbers of particles and their bodies, if there are several.
 
     Attributes:
         errors: after `run`, the error of each copy, or None.
@@ -80,7 +80,7 @@ class Simulation:
         total: bool = False,
         copies: int = 1,
         frictions: Sequence[Sequence[float]] | None = None,
-        bodies: tuple[int, ...] = (),
+        ranges: tuple[tuple[int, int], ...] = (),
     ):
         self.model, self.regions, self.steps, self.first, self.plan = model, regions, steps, first, plan
         x = state.x
@@ -94,7 +94,7 @@ class Simulation:
             total=total,
             copies=copies,
             scatter=scatter,
-            bodies=bodies,
+            ranges=ranges,
         )
         if model.changes:
             size = size._replace(n_poses=steps + 1)

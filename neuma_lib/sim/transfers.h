@@ -142,10 +142,10 @@
         return SHUFFLE(a, a, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3);
     };
     #define EACH_BLOCK                                                                                       \
-        for (int field = 0; field < c.fields; ++field)                                                       \
-            for (int body = field % c.bodies, copy_start = field / c.bodies * c.particles,                   \
-                     begin = copy_start + c.starts[body], stop = copy_start + c.starts[body + 1], used;      \
-                 begin < stop; begin += used)
+        for (int range = 0; range < c.copies * c.ranges; ++range)                                            \
+            for (int copy = range / c.ranges, own = range % c.ranges, field = copy * c.bodies + c.body_of[own], \
+                     begin = copy * c.particles + c.starts[own], stop = copy * c.particles + c.starts[own + 1], \
+                     used; begin < stop; begin += used)
     #define OPEN_BLOCK used = stop - begin < 16 ? stop - begin : 16
 
 // First and last node that particles touch in each row, from those of the rows of their first nodes. Nodes outside are
@@ -351,7 +351,7 @@
         store_trial((Real*)F_trial.data + 9 * begin, (const Real*)F.data + 9 * begin, C_p, used);
         bool all_fine = true;
         for (int l = 0; l < 16; ++l) all_fine &= fine[l] != 0;
-        for (int l = 0; l < (all_fine ? 0 : used); ++l) fault(begin + l, field / c.bodies);
+        for (int l = 0; l < (all_fine ? 0 : used); ++l) fault(begin + l, copy);
     }
 
 //// trial

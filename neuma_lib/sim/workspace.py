@@ -19,7 +19,7 @@ from torch import Tensor
 
 from neuma_lib.sim import kernels
 from neuma_lib.sim.adjoint_kernels import adjoint_kernels
-from neuma_lib.sim.bodies import MAX_BODIES, pair_table
+from neuma_lib.sim.bodies import MAX_RANGES, pair_table
 from neuma_lib.sim.clamp_kernels import hold_type, holds
 from neuma_lib.sim.colliders import SIZES, contact_radius
 from neuma_lib.sim.contact_kernels import STICKING, distances, obstacle_type, obstacles
@@ -54,14 +54,21 @@ class WorkspaceSize(NamedTuple):
     differentiable: bool = False
     total: bool = False  # whether the state includes the total deformation
     copies: int = 1  # independent simulations with equal numbers of particles
-    bodies: tuple[int, ...] = ()  # particles of each body of a copy, if there are several
+    ranges: tuple[
+        tuple[int, int], ...
+    ] = ()  # particles and body of each range of a copy, if there are several bodies
     scatter: str = "atomic"  # scatter method
     n_poses: int = 1  # steps of a segment if colliders or clamps change
 
     @property
+    def bodies(self) -> int:
+        """Number of bodies of a copy."""
+        return 1 + max((body for _, body in self.ranges), default=0)
+
+    @property
     def fields(self) -> int:
         """Number of grids: one of each body of each copy."""
-        return self.copies * max(1, len(self.bodies))
+        return self.copies * self.bodies
 
     @property
     def n_stresses(self) -> int:
@@ -140,7 +147,7 @@ class Workspace:
                 self.buffer((cached, nodes), "vec4"),
             )
         self.frictions = np.zeros((size.copies, len(size.model.frictions)))
-        self.pairs = self.buffer((size.fields, len(size.bodies) + 1), "real")
+        self.pairs = self.buffer((size.fields, size.bodies + 1), "real")
         self.obstacles = self._obstacles([0.0] * size.n_poses)
         self.distances = wp.array(
             distances(size.model.obstacles),
@@ -181,7 +188,7 @@ class Workspace:
                 self.native.record_adjoint()
             else:
                 self.grad_grid = self.buffer((2, nodes), "vec4")
-                of_bodies = nodes if size.bodies else 1
+                of_bodies = nodes if size.ranges else 1
                 self.grad_before, self.grad_around = (self.buffer((of_bodies,), "vec4") for _ in range(2))
                 self._record_adjoint()
 
@@ -213,7 +220,7 @@ class Workspace:
         self.vol0.copy_(vol0)
         self.radius.copy_(contact_radius(vol0))
         changed, self.frictions = not np.array_equal(frictions, self.frictions), frictions
-        if self.size.bodies:
+        if self.size.ranges:
             self._load_pairs(mass, vol0)
         if changed and self.size.n_poses == 1:
             self._load_obstacles([0.0])
@@ -221,15 +228,18 @@ class Workspace:
     def _load_pairs(self, mass: Tensor, vol0: Tensor) -> None:
         """Set the constants of the pairs of bodies."""
         size, tables = self.size, []
-        totals = [
-            [own.double().cpu() for own in values.reshape(size.copies, -1).split(size.bodies, dim=1)]
-            for values in (mass, vol0)
-        ]
-        for copy, frictions in enumerate(self.frictions[:, len(size.model.obstacles) :]):
-            fractions = [
-                float(v[copy].sum() / m[copy].sum()) / size.model.dx**3 for m, v in zip(*totals, strict=True)
-            ]
-            tables.append(pair_table(size.model.pairs, frictions, fractions, STICKING))
+        masses, volumes = np.zeros((2, size.copies, size.bodies))
+        start = 0
+        for k, (count, body) in enumerate(size.ranges):
+            own = slice(start, start + count)
+            masses[:, body] += mass.double().reshape(size.copies, -1)[:, own].sum(dim=1).cpu().numpy()
+            if k == body:  # not a branch, whose volume is that of its body
+                volumes[:, body] = vol0.double().reshape(size.copies, -1)[:, own].sum(dim=1).cpu().numpy()
+            start += count
+        for own, frictions in zip(
+            volumes / masses, self.frictions[:, len(size.model.obstacles) :], strict=True
+        ):
+            tables.append(pair_table(size.model.pairs, frictions, own / size.model.dx**3, STICKING))
         self.pairs.copy_(torch.from_numpy(np.concatenate(tables)))
 
     def pose_at(self, step: int) -> int:
@@ -342,7 +352,7 @@ class Workspace:
         ``bodies`` has the number of tracers of each body.
         """
         positions = wp.from_torch(tracers, dtype=warp_types(self.size.dtype).vec3)
-        starts = np.cumsum([0, *self.size.bodies[:-1]])[: len(bodies)]
+        starts = np.cumsum([0, *(count for count, _ in self.size.ranges)])[: len(bodies)]
         first_of = self.buffer((len(tracers),), dtype=torch.int32)
         first_of.copy_(torch.from_numpy(np.repeat(starts, bodies)))
         rows = self._rows(self.grid_v)
@@ -366,7 +376,7 @@ class Workspace:
         if self.size.total:
             _run(self._total_adjoint, now, after)
         _run(self._g2p_adjoint, now, after, cached, side, self.sorted_at(step), self.pose_at(step))
-        if self.size.bodies:
+        if self.size.ranges:
             _run(self._body_contact_adjoint, cached, side)
         _run(self._grid_adjoint, cached, side)
         _run(self._p2g_adjoint, now, cached, side, self.pose_at(step))
@@ -457,7 +467,7 @@ class Workspace:
             "contact": self._contact,
             **{shape: self._contact and shape in shapes for shape in SIZES if shape != "plane"},
             "clamps": bool(self.size.model.clamps),
-            "bodies": bool(self.size.bodies),
+            "bodies": bool(self.size.ranges),
             "walls": self.size.scatter == "native" and self.size.model.wall_nodes > 0,
         }
         return tuple(name for name, value in has.items() if value)
@@ -513,7 +523,7 @@ class Workspace:
             self.grad_v, self.grad_C, self.grad_F_trial, self.grad_x, self.grad_F, *held, grad_rows,
         )  # fmt: skip
         of_contact = self.grad_before, self.grad_around
-        if self.size.bodies:
+        if self.size.ranges:
             self._body_contact_adjoint = self.record(
                 k.body_contact_adjoint, nodes, 0, 0, self.grid, self.grad_grid, self.pairs, *of_contact
             )
@@ -572,9 +582,10 @@ def _grid_constants(size: WorkspaceSize):
     model, t = size.model, warp_types(size.dtype)
     c = t.GridConstants()
     c.particles, c.copies = size.particles // size.copies, size.copies
-    bodies = size.bodies or (c.particles,)
-    c.bodies, c.fields = len(bodies), size.fields
-    c.starts = t.starts(*np.cumsum([0, *bodies, *[0] * (MAX_BODIES - len(bodies))]).tolist())
+    ranges = size.ranges or ((c.particles, 0),)
+    c.bodies, c.fields, c.ranges = size.bodies, size.fields, len(ranges)
+    counts, body_of = zip(*ranges, *[(0, 0)] * (MAX_RANGES - len(ranges)), strict=True)
+    c.starts, c.body_of = t.starts(*np.cumsum([0, *counts]).tolist()), t.body_of(*body_of)
     c.n, c.wall_nodes, c.first = model.nodes, model.wall_nodes, model.first_node
     c.faces = len(WALLS) if model.contact == "particles" else 0
     c.walls = t.walls(*(_CONDITION_CODES[condition] for condition in model.boundary))
