@@ -49,7 +49,7 @@ def pair_table(
     volume fraction of a node per mass [1/kg].
 
     Args:
-        frictions: Coulomb coefficients of the given pairs, in place of their own.
+        frictions: Coulomb coefficients of the given pairs, which replace those of the pairs.
         fractions: volume fraction per mass of each body [1/kg], shape (B,).
     """
     table = np.full((len(fractions), len(fractions) + 1), largest)

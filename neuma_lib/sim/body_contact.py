@@ -2,7 +2,7 @@
 
 Each body has its own nodes (Bardenhagen et al. 2000). At a node, body a has the mass m_a and the velocity v_a. With the
 mean f_a of its volume fraction over 27 nodes (weights 1/4, 1/2, 1/4 along an axis) and its gradient g_a by central
-differences [1/dx], h_a = |g_a| / f_a tells the depth of the node in the body, also next to its edges: h is 0 deep
+differences [1/dx], h_a = |g_a| / f_a measures the depth of the node in the body, also next to its edges: h is 0 deep
 inside, about 1 at a plane surface, and 2 where the body ends. For a pair with the unit normal n, which points out of b,
 
     gap = (g_a . n / f_a - g_b . n / f_b - 2) dx

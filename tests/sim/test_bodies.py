@@ -121,7 +121,7 @@ REGIMES = {
 
 @pytest.mark.parametrize("regime", REGIMES)
 def test_gradients_of_each_regime(regime):
-    """Differences of three steps in which a block is apart from another, parts from it, sticks to it, or slips."""
+    """Differences of three steps in which a block does not touch another, parts from it, sticks to it, or slips."""
     gap, friction, approach = REGIMES[regime]
     model = MPM(14, DT, pairs=(Pair(0, 1, friction),))
     states = []
