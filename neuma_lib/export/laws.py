@@ -69,7 +69,7 @@ def law_for_engine(
         problem = f"{engine} has no {'structured laws' if isinstance(law, StructuredLaw) else 'networks'}"
         raise InputError(f"law {law.name}", problem, "Fit the nearest law that it has with --fit")
     else:
-        spec = specification(law.elasticity, law.plasticity)
+        spec = specification(law.elasticity, law.plasticity, law.viscosity)
     scale = known.get("scale") or 1.0
     if scale != 1.0:
         if not world:
