@@ -159,12 +159,17 @@ class Config(Section):
         return {"grid": captured.grid or self.captures.grid, "gravity": gravity}
 
     def obstacles(self, name: str) -> dict[str, Any]:
-        """Plain arguments of `neuma_lib.io.simulator.simulator` of a scene or an experiment with obstacles."""
+        """Plain arguments of `neuma_lib.io.simulator.simulator` of a scene or an experiment with obstacles or friction.
+
+        The faces of the cube have the friction of the scene, in an experiment of the first body's.
+        """
         base, _ = self.replicate(name)
-        of = self.experiments.get(base) or self.scenes[base]
-        lists = {"colliders": self.colliders(name)[1], "clamps": of.clamps}
+        experiment = self.experiments.get(base)
+        lists = {"colliders": self.colliders(name)[1], "clamps": (experiment or self.scenes[base]).clamps}
         plain = {key: [each.arguments() for each in entries] for key, entries in lists.items() if entries}
-        return plain | ({"contact": "particles"} if "colliders" in plain else {})
+        friction = self.scenes[experiment.bodies[0].scene if experiment else base].friction
+        plain |= {} if friction is None else {"boundary": friction}
+        return plain | ({"contact": "particles"} if plain.keys() & {"colliders", "boundary"} else {})
 
     def colliders(self, name: str) -> tuple[str, tuple[ColliderConfig, ...]]:
         """Path of the key with the colliders of a scene or an experiment, and them."""
