@@ -65,6 +65,9 @@ def _parser() -> argparse.ArgumentParser:
     scene.add_argument("name", metavar="NAME", help="name of the scene and of its folder in results/")
     mesh = "shape of the object, .obj, .ply, .stl or .glb with y up; copied to meshes/ if outside the project"
     scene.add_argument("--mesh", metavar="FILE", help=mesh)
+    chosen = "results of a scene with next.md: the scene of the experiment that it lists first, or --rank"
+    scene.add_argument("--from", dest="source", metavar="FOLDER", help=chosen)
+    scene.add_argument("--rank", type=int, default=1, help="rank of that experiment (default %(default)s)")
     capture = _command(
         new,
         _new_capture,
@@ -83,6 +86,33 @@ def _parser() -> argparse.ArgumentParser:
     )
     files = f"{CONFIGFILE}; or a capture.yaml. None: config/config.yaml alone"
     check.add_argument("files", nargs="*", metavar="FILE", help=files)
+
+    following = _command(
+        commands,
+        _next,
+        "next: rank what to film next to learn more about a material",
+        "Ranks launches and second cameras by what they are expected to add to an identified material, and writes "
+        "next.md, next.json and next.png to the folder. The section `next` of the settings has the limits of the lab. "
+        "Example: neuma next results/ClayCat",
+    )
+    following.add_argument("folder", metavar="FOLDER", help="folder of an identified scene, in results/")
+    following.add_argument("--cores", type=int, default=2, help="CPU cores to use (default %(default)s)")
+    following.add_argument("--configfile", nargs="+", default=[], metavar="FILE", help=CONFIGFILE)
+
+    lab = _command(
+        commands,
+        _lab,
+        "lab: repeat the choice in a simulated lab until the material is known",
+        "Chooses the best launch or camera, renders it, identifies all videos of the scene together, and repeats this "
+        "until all constants are determined or nothing more can be learned. The choice does not read the true "
+        "material. Writes lab.md and lab.json to the folder. Example: neuma lab results/ClayCat",
+    )
+    lab.add_argument("folder", metavar="FOLDER", help="folder of a rendered scene, in results/")
+    lab.add_argument(
+        "--experiments", type=int, default=4, help="maximum number of experiments (default %(default)s)"
+    )
+    lab.add_argument("--cores", type=int, default=2, help="CPU cores to use (default %(default)s)")
+    lab.add_argument("--configfile", nargs="+", default=[], metavar="FILE", help=CONFIGFILE)
 
     law = _group(commands, "law", "export a learned material to one file, or show such a file")
     export = _command(
@@ -270,10 +300,64 @@ def _demo(options: argparse.Namespace) -> int:
     return status
 
 
-def _new_scene(options: argparse.Namespace) -> None:
-    from neuma_lib.project.project import Project
-    from neuma_lib.project.scaffold import new_scene
+def _identified_folder(options: argparse.Namespace) -> tuple[Path, list[Path], Any]:
+    """Folder of a scene, its settings files, and a function that makes targets with settings files."""
+    from neuma_lib.extras import require
+    from neuma_lib.project.project import Project, remembered_settings
 
+    folder = Path(options.folder).absolute()
+    settings, root = Project.find(folder, options.configfile)
+    settings.scene(folder.name)
+    require("snakemake", "workflow")
+    files = [Path(file).absolute() for file in options.configfile] or remembered_settings(folder, root)
+    command = [sys.executable, "-m", "snakemake", f"--cores={options.cores}"]
+
+    def make(files: Sequence[Path], target: str) -> int:
+        given = ["--configfile", *map(str, files)] if files else []
+        return subprocess.run([*command, *given, "--", target], cwd=root).returncode
+
+    return folder, files, make
+
+
+def _lab(options: argparse.Namespace) -> int:
+    from neuma_lib.project.lab import run_lab
+
+    folder, files, make = _identified_folder(options)
+    complete = run_lab(folder, files, options.experiments, make, print)
+    if complete:
+        print(f"Experiments and constants: {folder / 'lab.md'}")
+    return int(not complete)
+
+
+def _next(options: argparse.Namespace) -> int:
+    from neuma_lib.project.project import project_folder
+
+    folder, files, make = _identified_folder(options)
+    if not (folder / "identified.json").is_file():
+        problem = "does not exist, so the material has not been identified"
+        remedy = f"Run `snakemake --cores {options.cores} {options.folder}/identified.json` first"
+        raise InputError(folder / "identified.json", problem, remedy)
+    page = folder / "next.md"
+    status = make(files, page.relative_to(project_folder(folder)).as_posix())
+    if status == 0:
+        print("\n".join(line for line in page.read_text().splitlines() if line[:2] in ("1.", "2.", "3.")))
+        print(f"All candidates and pictures: {page}")
+    return status
+
+
+def _new_scene(options: argparse.Namespace) -> None:
+    from neuma_lib.project.project import Project, remembered_settings
+    from neuma_lib.project.scaffold import new_scene, next_scene
+
+    if options.source:
+        folder = Path(options.source).absolute()
+        settings, root = Project.find(folder)
+        file = next_scene(root, options.name, settings, folder, options.rank).relative_to(root)
+        files = [*(path.relative_to(root) for path in remembered_settings(folder, root)), file]
+        target = (folder / "identified.json").relative_to(root)
+        print(f"Created {file}. To render it and identify both videos together, run in {root}:")
+        print(f"  snakemake --cores 2 --configfile {' '.join(map(str, files))} -- {target}")
+        return
     settings, root = Project.find(".")
     file, name = new_scene(root, options.name, settings, options.mesh).relative_to(root), options.name
     print(f"Created {file}. Edit it, then run in {root}:")
