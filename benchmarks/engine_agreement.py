@@ -74,7 +74,7 @@ def ours(scene: EngineScene, spec: dict, boundary: str = "slip") -> np.ndarray:
 def played(folder: Path) -> dict[str, np.ndarray]:
     """Arrays ``t``, ``x`` and perhaps ``masses`` of an exported scene."""
     if not (folder / "motion.npz").exists():
-        subprocess.run([sys.executable, str(folder / "run.py")], check=True, stdout=sys.stderr)
+        subprocess.run([sys.executable, "run.py"], cwd=folder, check=True, stdout=sys.stderr)
     with np.load(folder / "motion.npz") as motion:
         return dict(motion)
 
@@ -134,34 +134,41 @@ def drop(folder: Path, engines: list[str]) -> None:
 def scene(folder: Path, source: str, engines: list[str], count: int = 4) -> None:
     """Play the scene of a method's folder in each engine, by its law or the nearest one, however far it is.
 
-    Writes motions, table.md with distances between the centre and that of the true motion, and silhouettes.png.
+    Writes motions, table.md with distances between the centre and that of the true motion, and silhouettes.png. This
+    library plays the law of the method, and the exported law, whose constants are those of the material.
     """
     filmed = nm.Scene.load(Path(source).absolute().parent)
-    own, _ = read_arrays(Path(source) / "rollout.h5", required=("x", "frames"))
     assert filmed.truth is not None, "a scene with a true motion is needed"
-    motions = [("true motion", np.array(filmed.truth.frames) * filmed.mpm.dt, filmed.truth.x.numpy(), None)]
-    motions.append(("this library", own["frames"] * filmed.mpm.dt, own["x"], None))
+    own, _ = read_arrays(Path(source) / "rollout.h5", required=("x", "frames"))
+    steps, motions = filmed.truth.frames, {}
+    ours = {"true motion": (steps, filmed.truth.x.numpy()), "this library": (own["frames"], own["x"])}
     for engine in engines:
         for options in ([], ["--fit"], ["--fit", "--force"]):
             if neuma(["scene", "export", source, str(folder / engine), "--engine", engine, *options]) == 0:
                 break
-        motion, about = played(folder / engine), read_json(folder / engine / "scene.json")
-        error = f", stress error {100 * max(about['fit'].values()):.0f} %" if about["fit"] else ""
-        name = f"{engine}, {about['law']['elasticity']['name']}{error}"
-        motions.append((name, motion["t"], motion["x"], motion.get("masses")))
-    times, rows, pictures = motions[0][1], [], []
+        about, name = read_json(folder / engine / "scene.json"), engine
+        if about["fit"]:
+            family, error = about["law"]["elasticity"]["name"], max(about["fit"].values())
+            name = f"{engine}, {family}: stress error {100 * error:.0f} %"
+        else:
+            law = nm.Law.from_spec(about["law"], filmed.mpm.dt)
+            path = nm.simulate(filmed.mpm, law, filmed.state(), steps)
+            ours["this library, exported"] = (steps, path.x.numpy())
+        motions[name] = played(folder / engine)
+    motions = {name: {"t": np.array(n) * filmed.mpm.dt, "x": x} for name, (n, x) in ours.items()} | motions
+    times, rows, pictures, true = motions["true motion"]["t"], [], [], None
     displayed = times[np.linspace(0, len(times) - 1, count).round().astype(int)]
-    for name, t, x, m in motions:
-        centre = np.average(x, axis=1, weights=m)
+    for name, motion in motions.items():
+        t, x = motion["t"], motion["x"]
+        centre = np.average(x, axis=1, weights=motion.get("masses"))
         centre = np.stack([np.interp(times, t, centre[:, k]) for k in range(3)], axis=1)
-        if not rows:
-            true = centre
-        distance = 1e3 * np.linalg.norm(centre - true, axis=1)
+        true = centre if true is None else true
+        distance = np.linalg.norm(centre - true, axis=1)
         rows.append(
-            [name, f"{distance.mean():.1f}", f"{distance.max():.1f}", f"{1e3 * centre[:, 1].min():.0f}"]
+            [name, *(f"{1e3 * each:.0f}" for each in (distance.mean(), distance.max(), centre[:, 1].min()))]
         )
         nearest = [int(np.abs(t - now).argmin()) for now in displayed]
-        pictures.append((name, x[nearest], [f"{t[k]:.3f} s" for k in nearest]))
+        pictures.append((name.replace(", ", "\n"), x[nearest], [f"{t[k]:.3f} s" for k in nearest]))
     report(folder, ["engine", "centre, mean [mm]", "largest [mm]", "lowest centre [mm]"], rows, pictures)
 
 
