@@ -413,21 +413,19 @@ def _export(options: argparse.Namespace) -> None:
 
 
 def _export_to_engine(options: argparse.Namespace, law: Law, known: dict[str, Any]) -> None:
-    from neuma_lib.export.laws import USD, law_for_engine, write_engine_law
+    from neuma_lib.export.laws import law_for_engine
     from neuma_lib.export.materials import ENGINES, check_engine
+    from neuma_lib.export.scenes import write_law_scene
 
-    check_engine(options.engine, (*ENGINES, USD))
-    engine = "newton" if options.engine == USD else options.engine
-    if options.engine == USD and Path(options.target).suffix != ".usda":
+    check_engine(options.engine, (*ENGINES, "usd"))
+    engine = "newton" if options.engine == "usd" else options.engine
+    if options.engine == "usd" and Path(options.target).suffix != ".usda":
         raise InputError(options.target, "the suffix is not .usda", "Give the file that suffix")
     if options.weight != 1.0 or options.page or options.separate_adaptor:
         raise InputError("--engine", "has no --weight, --page or --separate", "Leave them out")
-    names = ("density", "substep", "fit", "force", "world")
-    states = _visited_states(known)
-    material, about = law_for_engine(
-        law, known, engine, states=states, **{name: getattr(options, name) for name in names}
-    )
-    write_engine_law(options.target, engine, material, about)
+    own = {name: getattr(options, name) for name in ("density", "substep", "fit", "force", "world")}
+    material, about = law_for_engine(law, known, engine, states=_visited_states(known), **own)
+    write_law_scene(options.target, engine, material, about)
     _print_material(options.target, material, about)
 
 
@@ -480,12 +478,12 @@ def _scene_export(options: argparse.Namespace) -> None:
     frames = scene.video.frames if scene.video else scene.truth.frames if scene.truth else (0, 400)
     every = min(b - a for a, b in zip(frames[:-1], frames[1:], strict=True))
     own = EngineScene.of(scene.mpm, scene.state(), frames[-1], every, scene.reconstruction.gaussians)
-    known["scale"] = None  # the whole scene keeps the scale of the simulator
+    scale, known["scale"] = known.get("scale"), None  # the whole scene keeps the scale of the simulator
     material, about = law_for_engine(
         law, known, options.engine, density=own.density, substep=own.dt, fit=options.fit, force=options.force,
         states=_visited_states(known),
     )  # fmt: skip
-    notes = export_scene(options.target, options.engine, own, about["law"], about)
+    notes = export_scene(options.target, options.engine, own, about["law"], {**about, "scale": scale or 1.0})
     _print_material(options.target, material._replace(notes=tuple(notes)), about)
     print(f"Play it with: python {options.target}/run.py")
 
