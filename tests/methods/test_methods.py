@@ -104,7 +104,7 @@ def test_neuma_is_a_prior_with_an_adaptor(tmp_path, stable):
 
 
 def test_neuma_may_have_the_inputs_of_the_constants(changed):
-    """All rows that start as identified have the same options of motion, NeuMA with its training otherwise unchanged."""
+    """All rows that start as identified have the same options of motion. NeuMA's training is otherwise the same."""
     settings = changed()
     shared = ("covariance_from", "gaussian_motion", "start", "views", "particle_source", "assumed_density")
 
