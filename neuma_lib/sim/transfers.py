@@ -84,6 +84,9 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         faults: wp.array2d(dtype=wp.int64),
     ): ...  # fmt: skip
 
+    @wp.func_native(_native(dtype, "lanes", "block", "advect"))
+    def advect_loop(c: GridConstants, grid_v: wp.array(dtype=vec4), x: wp.array(dtype=vec3)): ...
+
     @wp.func_native(_native(dtype, "lanes", "trial"))
     def trial_loop(
         c: GridConstants, C_after: wp.array(dtype=mat33), F: wp.array(dtype=mat33), F_trial: wp.array(dtype=mat33)
@@ -268,6 +271,11 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         )
 
     @kernel
+    def advect_tracers(c: GridConstants, grids: wp.array2d(dtype=vec4), x: wp.array(dtype=vec3)):
+        """As `kernels.advect_tracers`."""
+        advect_loop(c, grids[1], x)
+
+    @kernel
     def trial_deformation(
         c: GridConstants,
         now: wp.int32,
@@ -435,6 +443,7 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         p2g=p2g,
         grid_update=grid_update,
         g2p=g2p,
+        advect_tracers=advect_tracers,
         trial_deformation=trial_deformation,
         move_held=move_held,
         g2p_adjoint=g2p_adjoint,

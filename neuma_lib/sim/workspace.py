@@ -311,13 +311,15 @@ class Workspace:
     def tracer_launch(self, tracers: Tensor) -> wp.Launch:
         """A recorded launch, for `move_tracers` and `SegmentLoop`, that advects `tracers` (M, 3) in place."""
         positions = wp.from_torch(tracers, dtype=warp_types(self.size.dtype).vec3)
+        if self.native:
+            return self.native.tracer_launch(positions)
         return self.record(
             self._deformation.advect_tracers, len(tracers), 0, self._rows(self.grid_v), positions
         )
 
     def move_tracers(self, launch: wp.Launch, step: int) -> None:
         """Advect tracers by the node velocities of a step."""
-        _run(launch, 0 if self.native else self.cached_at(step))
+        _run(launch, *([] if self.native else [self.cached_at(step)]))
 
     def transfer_adjoint(self, step: int) -> None:
         """From gradients of the state after a step and of F_trial to those of the state before it and of tau.
