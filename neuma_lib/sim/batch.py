@@ -10,9 +10,9 @@ import torch
 
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.mechanics.law import Law
-from neuma_lib.mechanics.side_by_side import fusible, side_by_side
+from neuma_lib.mechanics.side_by_side import fusible, has_kernels, side_by_side
 from neuma_lib.sim.model import MPM, MaterialRegion
-from neuma_lib.sim.rollout import check_inside, checked_frames, fly_and_simulate
+from neuma_lib.sim.rollout import check_bodies, check_inside, checked_frames, fly_and_simulate
 from neuma_lib.sim.state import State, Trajectory
 from neuma_lib.threads import in_threads
 
@@ -36,8 +36,8 @@ def rollout_batch(
     """`rollout` for each of several laws, equal to round-off, without gradients.
 
     On a GPU, copies share launches. Analytic laws with kernels (`analytic_kernels`) are evaluated in one launch for any
-    kinds and constants. Other laws share only the transfers. On a CPU, copies of laws with kernels run in threads
-    (`threads.in_threads`), with the same results for any number of threads.
+    kinds and constants. Other laws share only the transfers, those with a viscous part nothing. On a CPU, copies of
+    laws with kernels run in threads (`threads.in_threads`), with the same results for any number of threads.
 
     Args:
         model: as in `rollout`, one for all laws or one per law. They may differ in friction.
@@ -56,7 +56,8 @@ def rollout_batch(
     """
     frames = checked_frames(frames, steps)
     starts = [start] * len(laws) if isinstance(start, State) else list(start)
-    if not laws or len(starts) != len(laws) or len({len(state.x) for state in starts}) > 1:
+    alike = len({(len(state.x), state.bodies) for state in starts}) == 1
+    if not laws or len(starts) != len(laws) or not alike:
         raise InputError(
             "laws",
             f"{len(laws)} laws do not match initial states of {[len(state.x) for state in starts]} particles",
@@ -71,21 +72,24 @@ def rollout_batch(
             "Give one for all",
         )
     for state in {id(state): state for state in starts}.values():
+        check_bodies(model, state)
         check_inside(model, state.x)
     order = sorted(range(len(laws)), key=lambda copy: not fusible(laws[copy]))
     device, dtype = starts[0].x.device, starts[0].x.dtype
     together = together or TOGETHER[device.type]
-    groups = [order[i : i + together] for i in range(0, len(laws), together)]
+    viscous = [copy for copy in order if laws[copy].viscosity is not None]
+    order = [copy for copy in order if laws[copy].viscosity is None]
+    groups = [order[i : i + together] for i in range(0, len(order), together)] + [[copy] for copy in viscous]
 
     def simulated(copies: Sequence[int]) -> list[Trajectory | None]:
         own = [laws[copy] for copy in copies], [starts[copy] for copy in copies]
         frictions = [models[copy].frictions for copy in copies]
         return _side_by_side(model, *own, frames, total, skip_free_flight, frictions)
 
-    threads = 1 if device.type == "cuda" or not all(map(fusible, laws)) else None
+    threads = 1 if device.type == "cuda" or not all(map(has_kernels, laws)) else None
     paths = in_threads(simulated, groups, (rollout_batch, model.frictionless, dtype, total), threads)
     result: list[Trajectory | None] = [None] * len(laws)
-    for copy, path in zip(order, chain.from_iterable(paths), strict=True):
+    for copy, path in zip(order + viscous, chain.from_iterable(paths), strict=True):
         result[copy] = path
     return result
 
@@ -111,7 +115,16 @@ def _side_by_side(
     state = State.joined(starts) if copies > 1 else starts[0]
     try:
         path, errors = fly_and_simulate(
-            model, tuple(regions), state, frames, None, total, skip_free_flight, copies, frictions=frictions
+            model,
+            tuple(regions),
+            state,
+            frames,
+            None,
+            total,
+            skip_free_flight,
+            copies,
+            frictions=frictions,
+            bodies=starts[0].bodies,
         )
     except NonFiniteError as error:
         if copies > 1 and error.step is None:  # from the code of a law, which does not state the copy
