@@ -106,7 +106,7 @@ class PairConfig(Section):
 class SceneConfig(Section):
     """A simulated object with its true law and the prior of its reconstruction, a captured object, or a splat.
 
-    Or several bodies, each with a shape, a start and a law of its own. These keys of the scene are then left out.
+    Or several bodies, each with its own shape, start and law, in place of these keys of the scene.
     """
 
     like: str | None = Field(None, description="scene with the settings that this one does not set")

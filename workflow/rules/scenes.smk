@@ -204,10 +204,7 @@ def body_settings(*keys):
     """A function of wildcards: the named settings of the bodies of a scene or experiment."""
     return by_subject(
         lambda scene: (
-            [
-                {key: body[key] for key in ("name", *keys)}
-                for body in SETTINGS.scene_bodies(scene)
-            ]
+            [{key: body[key] for key in ("name", *keys)} for body in SETTINGS.scene_bodies(scene)]
             if SETTINGS.scene(scene).bodies
             else [scene_setting(*keys)(SimpleNamespace(scene=scene))]
         ),
