@@ -139,9 +139,11 @@ class Config(Section):
         for body in self.experiment(name).bodies:
             scene = self.scene(body.scene).plain()
             keys = ("shape", "size", "height", "center", "velocity", "spin", "density", "law", "appearance")
+            rotation = scene["rotation"] if body.shape is None else [0.0, 0.0, 0.0]
             own = {key: value for key, value in body.plain().items() if value is not None}
             own |= {"size": body.size} if body.shape is not None else {}
-            bodies.append({**{key: scene[key] for key in keys}, **own, "reconstructed": body.shape is None})
+            whole = {**{key: scene[key] for key in keys}, "rotation": rotation, **own}
+            bodies.append({**whole, "reconstructed": body.shape is None})
         return bodies
 
     def experiment_dt(self, name: str) -> float:
@@ -158,15 +160,21 @@ class Config(Section):
         return {"grid": captured.grid or self.captures.grid, "gravity": gravity}
 
     def obstacles(self, name: str) -> dict[str, Any]:
-        """Plain arguments of `neuma_lib.io.simulator.simulator` of a scene or an experiment with obstacles."""
+        """Plain arguments of `neuma_lib.io.simulator.simulator` of a scene or an experiment with obstacles or friction.
+
+        The faces of the cube have the friction of the scene, in an experiment of the first body's.
+        """
         base, _ = self.replicate(name)
-        of = self.experiments.get(base) or self.scenes[base]
-        lists = {"colliders": self.colliders(name)[1], "clamps": of.clamps}
+        experiment = self.experiments.get(base)
+        lists = {"colliders": self.colliders(name)[1], "clamps": (experiment or self.scenes[base]).clamps}
         plain = {key: [each.arguments() for each in entries] for key, entries in lists.items() if entries}
-        bodies = list(getattr(of, "bodies", ())) if base in self.scenes else []
-        if bodies and of.pairs:
-            plain["pairs"] = [_pair_arguments(pair, bodies) for pair in of.pairs]
-        return plain | ({"contact": "particles"} if bodies or "colliders" in plain else {})
+        friction = self.scenes[experiment.bodies[0].scene if experiment else base].friction
+        plain |= {} if friction is None else {"boundary": friction}
+        scene = None if experiment else self.scenes[base]
+        if scene and scene.pairs:
+            plain["pairs"] = [_pair_arguments(pair, list(scene.bodies)) for pair in scene.pairs]
+        touches = plain.keys() & {"colliders", "boundary"} or scene and scene.bodies
+        return plain | ({"contact": "particles"} if touches else {})
 
     def scene_bodies(self, name: str) -> list[dict[str, Any]]:
         """Plain descriptions of the bodies of a scene: those of several with their ``name``, or the scene itself."""

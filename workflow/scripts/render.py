@@ -27,7 +27,9 @@ def main(inputs, output, params, run) -> None:
     steps, meshes = arrays["frames"].tolist() if params.moving else [0], iter(listed(inputs.meshes))
     made = []
     for k, own in enumerate(params.bodies):
-        mesh = place(solid(own["shape"], meshes), own["size"], own["height"], own["center"])
+        mesh = place(
+            solid(own["shape"], meshes), own["size"], own["height"], own["center"], rotation=own["rotation"]
+        )
         points = [arrays[name][: len(steps)] for name in ("x", "tracers")]
         if len(params.bodies) > 1:
             points = [values[:, arrays[owner] == k] for values, owner in zip(points, owners, strict=True)]
