@@ -321,3 +321,27 @@ def test_a_record_is_read_and_a_missing_family_refused(alone):
     with refused("identified.json"):
         read_fit(record, settings(other=law("neo_hookean")))
     assert read_rivals(record, settings(), fit, 2) == []
+
+
+def linearised(values, covariance=None, spec=HENCKY):
+    family = Family("tested", spec)
+    each = experiment(std=(0.0,) * 6).residuals(settings())
+    assert each.observe(Candidate(family.law_spec(values), np.zeros(NUISANCES)))
+    return FamilyRun(family, [each], [len(FRAMES)], settings()).linearise_at(values, covariance).curvature
+
+
+def test_narrow_differences_are_derivatives():
+    """With a tiny covariance along the constants, differences have the width of derivatives, 4 %, on the side with the
+    smaller change. For E, whose images change smoothly, the sides differ by less than a third."""
+    values = {"E": 3e4, "nu": 0.3}
+    derivatives, narrow = (np.diag(linearised(values, each)) for each in (None, np.diag([1e-8, 2e-8])))
+    assert (narrow <= derivatives * (1 + 1e-9)).all() and narrow[0] > derivatives[0] * 2 / 3
+
+
+def test_a_plateau_has_less_information_than_its_edge():
+    """A yield stress just below the largest stress of the launch: lower ones change the images, higher ones do not."""
+    plastic = law("hencky", "von_mises", yield_stress=12e3)
+    values = {"E": 3e4, "nu": 0.3, "yield_stress": 12e3}
+    edge = linearised(values, spec=plastic)[2, 2]
+    wide = linearised(values, np.diag([1e-8, 1e-8, 1.0]), plastic)[2, 2]
+    assert wide < 0.1 * edge
