@@ -312,6 +312,11 @@ def test_candidates_are_ranked_and_written(alone):
     assert after == sorted(after) and after[0] < choice.before and choice.useful
     written = choice.as_dict()
     assert written["candidates"][0]["expected"] == stds(choice.options[0].forecast.fit, chosen)
+    for box, room in zip(written["candidates"], choice.as_dict(scale=2.0)["candidates"], strict=True):
+        if box["kind"] == "launch":
+            assert box["settings"]["velocity"] == [2 * v for v in room["settings"]["velocity"]]
+            assert box["settings"]["height"] == 2 * room["settings"]["height"]
+            assert box["settings"]["spin"] == room["settings"]["spin"]
 
 
 def test_a_record_is_read_and_a_missing_family_refused(alone):
