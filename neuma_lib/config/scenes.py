@@ -85,6 +85,10 @@ class SceneConfig(Section):
     center: tuple[float, float] = Field(
         (0.5, 0.5), description="initial x and z of the centre of the bounding box [m]"
     )
+    rotation: Vector = Field(
+        (0.0, 0.0, 0.0),
+        description="rotation vector of the shape, before it is placed at height and center [rad]",
+    )
     velocity: Vector | None = Field(description="initial velocity [m/s]")
     spin: Vector = Field(
         (0.0, 0.0, 0.0), description="initial angular velocity about the centre of mass, world axes [rad/s]"

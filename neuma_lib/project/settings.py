@@ -138,9 +138,11 @@ class Config(Section):
         for body in self.experiment(name).bodies:
             scene = self.scene(body.scene).plain()
             keys = ("shape", "size", "height", "center", "velocity", "spin", "density", "law", "appearance")
+            rotation = scene["rotation"] if body.shape is None else [0.0, 0.0, 0.0]
             own = {key: value for key, value in body.plain().items() if value is not None}
             own |= {"size": body.size} if body.shape is not None else {}
-            bodies.append({**{key: scene[key] for key in keys}, **own, "reconstructed": body.shape is None})
+            whole = {**{key: scene[key] for key in keys}, "rotation": rotation, **own}
+            bodies.append({**whole, "reconstructed": body.shape is None})
         return bodies
 
     def experiment_dt(self, name: str) -> float:
