@@ -4,9 +4,10 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from neuma_lib.fitting.resting import RestingBody, Still, StillResiduals
+from neuma_lib.fitting.resting import RestingBody, StillResiduals
 from neuma_lib.geometry.blocks import hexahedra
 from neuma_lib.geometry.outline import silhouette
+from neuma_lib.io.datasets.stills import Still
 from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.clamps import Clamp
 
