@@ -46,6 +46,10 @@ class StillsConfig(Section):
         (0.03, 0.015),
         description="largest edge of an element in two meshes, from which results are extrapolated [m]",
     )
+    photographs: bool = Field(
+        True,
+        description="whether the figure shows the photographs, whose licence may not allow to pass it on",
+    )
     bodies: dict[str, RestingBodyConfig] = Field({}, description="bodies by name")
 
     @model_validator(mode="after")

@@ -47,16 +47,22 @@ _ROUNDS = 4  # after each of which points near hidden parts are chosen again
 _MAX_STEP = 3.0
 
 
+def contours(mask: NDArray[np.bool_]) -> list[Array]:
+    """Closed contours of a mask (H, W) with holes, shape (n, 2) each [px], pixel centres at half integers."""
+    lines = find_contours(np.pad(mask, 1).astype(float), 0.5)
+    return [line[:, ::-1] - 0.5 for line in lines]  # padding, and half a pixel
+
+
 def contour(mask: NDArray[np.bool_]) -> Array:
     """Points of the longest contour of a mask (H, W) at equal distances, shape (C, 2) [px].
 
     Raises:
         InputError: the mask is empty.
     """
-    lines = find_contours(np.pad(mask, 1).astype(float), 0.5)
+    lines = contours(mask)
     if not lines:
         raise InputError("mask", "shows no body")
-    line = max(lines, key=len)[:, ::-1] - 0.5  # padding and half a pixel
+    line = max(lines, key=len)
     reached = np.concatenate([[0], np.linalg.norm(np.diff(line, axis=0), axis=1).cumsum()])
     count = max(4, round(reached[-1] / _SPACING))
     sites = np.arange(count) * reached[-1] / count

@@ -145,7 +145,9 @@ def test_derivative_by_the_stiffness_equals_that_of_solutions():
         ).x
         for sign in (1, -1)
     ]
-    slope = np.subtract(*ends) / (2 * step)  # truncation step^2 = 1e-6, tolerance / step = 1e-3, mostly far less
+    slope = np.subtract(*ends) / (
+        2 * step
+    )  # truncation step^2 = 1e-6, tolerance / step = 1e-3, mostly far less
     assert np.abs(solution.by_stiffness - slope).max() < 1e-4 * np.abs(slope).max()
     assert (
         solution.residual < 1e-6 and solution.by_stiffness[solution.free][:, 1].max() > 0
