@@ -235,7 +235,7 @@ def _newton(
 
     A linear step of a part that turns by an angle changes its volume by the square of the angle, and the pressure that
     follows would dominate the tangent. The tangent therefore has the pressure that the last step predicted linearly,
-    as if the pressure were an unknown of its own (Magisano, Leonardi and Garcea 2017). Both agree at the solution.
+    as if the pressure were a separate unknown (Magisano, Leonardi and Garcea 2017). Both agree at the solution.
     """
     size = float(np.linalg.norm(load[free])) or 1.0
     number = np.full(len(x), -1)

@@ -63,7 +63,7 @@ def test_a_marker_has_two_poses_of_which_one_is_true():
 
 @pytest.mark.slow
 def test_a_record_is_fitted_under_each_clamp_and_predicts_another(record):
-    """The true clamp has the true stiffness. With a deeper clamp the beam is longer, and must be stiffer to sag alike."""
+    """The true clamp has the true stiffness. A deeper clamp lengthens the beam, which must then be stiffer."""
     settings, stills = RestingBodyConfig(**BODY), read_stills(record, "twin")
     mesh, poses = read_any_mesh(record / "beam.obj"), [beam.POSE]
     steps = []
@@ -95,7 +95,10 @@ def test_the_uncertainty_over_clamps_contains_each():
     "wrong, where",
     [
         ({"sizes": (0.01, 0.02)}, "sizes"),
-        ({"bodies": {"beam": BODY, "spine": BODY | {"predicted_from": "bean"}}}, "bodies.spine.predicted_from"),
+        (
+            {"bodies": {"beam": BODY, "spine": BODY | {"predicted_from": "bean"}}},
+            "bodies.spine.predicted_from",
+        ),
         ({"bodies": {"beam": BODY | {"hidden": {"lowest": [0, 0, 0], "highest": [1, 1, 0]}}}}, "highest"),
     ],
 )

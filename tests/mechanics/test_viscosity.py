@@ -42,7 +42,7 @@ def test_the_kernel_of_the_spring_equals_its_formula():
 
 @pytest.mark.parametrize("viscosity", [MAXWELL, KELVIN_VOIGT], ids=lambda own: own["name"])
 def test_a_vibration_has_the_modulus_of_the_branch(viscosity):
-    """G i w T / (1 + i w T), or i w viscosity, to its lag of 3/2 w dt = 0.45 % at most, in pure shear of small strain."""
+    """G i w T / (1 + i w T), or i w viscosity, to a lag of 3/2 w dt = 0.45 %, in pure shear."""
     dt, omega, size = 1e-4, 30.0, 1e-3
     branch = law_of(viscosity, dt).viscosity.branch
     steps = round(2 * math.pi / omega / dt)

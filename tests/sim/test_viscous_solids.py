@@ -183,8 +183,8 @@ def test_a_column_rings_with_the_damping_of_its_law(name):
     """Of small vibrations exp(s t) with the shear modulus G(s) = mu + G s T / (1 + s T).
 
     A column with nu = 0 and bulk modulus K has E(s) = 9 K G(s) / (3 K + G(s)), and s^2 = -w^2 E(s) / E with the
-    frequency w without a viscous part, measured. The damping of the simulation itself, measured in the same way, is added. Its
-    own change and that by the time step, w dt / 2 = 1 % of it, are neglected.
+    frequency w without a viscous part, measured. The damping of the simulation itself, measured in the same way, is
+    added. Its own change and that by the time step, w dt / 2 = 1 % of it, are neglected.
     """
     E = 2e4
     times, height, omega = vibration(None)

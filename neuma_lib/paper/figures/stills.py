@@ -62,11 +62,11 @@ def _row(
         predicted & np.roll(predicted, 1, 0) & np.roll(predicted, -1, 0)
         & np.roll(predicted, 1, 1) & np.roll(predicted, -1, 1)
     )  # fmt: skip
-    shown = (picture * _DIM + 255 * (1 - _DIM)).astype(np.uint8)
-    shown[predicted & ~hidden] = (0.5 * shown[predicted & ~hidden] + 0.5 * np.array(_PREDICTED)).astype(
+    tinted = (picture * _DIM + 255 * (1 - _DIM)).astype(np.uint8)
+    tinted[predicted & ~hidden] = (0.5 * tinted[predicted & ~hidden] + 0.5 * np.array(_PREDICTED)).astype(
         np.uint8
     )
-    shown[outline] = 0
+    tinted[outline] = 0
     difference = np.full_like(picture, 255)
     for part, colour in (
         (observed & predicted, _BOTH),
@@ -84,7 +84,7 @@ def _row(
             (round(_WIDTH * _ASPECT), _WIDTH), (width * _ASPECT, width), centre, observed.shape, strict=True
         )
     ]
-    return [image[np.ix_(*sites)] for image in (picture, shown, difference)]
+    return [image[np.ix_(*sites)] for image in (picture, tinted, difference)]
 
 
 @style.styled
