@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field, model_validator
 
-from neuma_lib.config.base import Section, Vector
+from neuma_lib.config.base import Section, Vector, internal
 from neuma_lib.config.obstacles import RegionConfig
 from neuma_lib.config.validation import hint
 from neuma_lib.errors import InputError
@@ -13,7 +13,6 @@ from neuma_lib.errors import InputError
 class RestingBodyConfig(Section):
     """A clamped body that hangs at rest, in the frame of its mesh after scaling."""
 
-    title: str = Field("", description="name in tables and figures; empty: the key of the body")
     record: str = Field(description="name of the record in frames.json")
     mesh: str = Field(description="closed surface of blocks, relative to `stills.root`")
     unit: float = Field(1.0, gt=0, description="unit of length of the mesh [m]")
@@ -30,8 +29,7 @@ class RestingBodyConfig(Section):
         min_length=1, description="regions that may be held, by name: alternatives, with a fit each"
     )
     hidden: RegionConfig = Field(description="region of the undeformed body that other objects hide or stain")
-    nu: float = Field(0.49, ge=0, lt=0.5, description="Poisson's ratio of the neo-Hookean solid")
-    ratio: float = Field(60.0, gt=0, description="mu / rho before the fit [m^2/s^2]")
+    nu: float = internal(0.49, "Poisson's ratio of the neo-Hookean solid", ge=0, lt=0.5)
     predicted_from: str | None = Field(
         None,
         description="body of the same material whose mu / rho predicts this one; null: mu / rho is fitted",
@@ -42,13 +40,11 @@ class StillsConfig(Section):
     """Stiffness over density of bodies at rest under gravity, each in photographs with one marker."""
 
     root: str = Field("", description="folder of the records, with frames.json and calibration.json")
-    sizes: tuple[float, float] = Field(
-        (0.03, 0.015),
-        description="largest edge of an element in two meshes, from which results are extrapolated [m]",
+    sizes: tuple[float, float] = internal(
+        (0.03, 0.015), "largest edge of an element in two meshes, from which results are extrapolated [m]"
     )
-    photographs: bool = Field(
-        True,
-        description="whether the figure shows the photographs, whose licence may not allow to pass it on",
+    photographs: bool = internal(
+        True, "whether the figure has the photographs, whose licence may not allow to pass it on"
     )
     bodies: dict[str, RestingBodyConfig] = Field({}, description="bodies by name")
 

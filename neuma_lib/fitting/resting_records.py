@@ -25,6 +25,8 @@ Progress = Callable[[int, int], None]
 
 SURFACE = 0.005
 """Edge of the triangles of the surface [m]. On a beam that bends with a radius of 10 cm, chords are 0.03 mm inside."""
+FIRST_RATIO = 60.0
+"""mu / rho before the fit [m^2/s^2]. Fits from 30 to 200 end at the same value."""
 _MODULUS = 100.0  # any: only its ratio to the density matters
 
 
@@ -83,7 +85,7 @@ def fit_record(
                         [before.pose] if before else poses,
                         np.array(settings.placement),
                         settings.placement_std,
-                        before.ratio if before else settings.ratio,
+                        before.ratio if before else FIRST_RATIO,
                     )
                 )
                 done += 1

@@ -388,7 +388,7 @@ FIGURES = {
     "stills": {
         "kind": "h5",
         "input": {
-            "results": [f"{RESULTS}/stills/{body}.json" for body in RESTING.bodies],
+            "results": checked(lambda wildcards: resting_results()),
             "photographs": checked(lambda wildcards: resting_pictures("file")),
             "masks": checked(lambda wildcards: resting_pictures("mask")),
         },

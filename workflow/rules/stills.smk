@@ -3,7 +3,7 @@
 from neuma_lib.io.datasets.stills import still_files
 
 RESTING = SETTINGS.stills
-RESTING_TITLES = [body.title or name for name, body in RESTING.bodies.items()]
+RESTING_TITLES = [name.replace("_", " ") for name in RESTING.bodies]
 
 
 def resting_body(wildcards):
@@ -13,12 +13,22 @@ def resting_body(wildcards):
 def resting_inputs(body):
     """Photographs' masks, the mesh, and the fit of the body that predicts this one."""
     settings = RESTING.bodies[body]
+    source = settings.predicted_from
     return {
         "masks": still_files(RESTING.root, settings.record, "mask"),
         "frames": [f"{RESTING.root}/{name}.json" for name in ("frames", "calibration")],
         "mesh": f"{RESTING.root}/{settings.mesh}",
-        "source": [f"{RESULTS}/stills/{settings.predicted_from}.json"] if settings.predicted_from else [],
+        **({"source": f"{RESULTS}/stills/{source}.json"} if source else {}),
     }
+
+
+def resting_results():
+    """Results of all bodies. Raises InputError if there are none."""
+    if not RESTING.bodies:
+        raise InputError(
+            "stills.bodies", "there are none", "Use for example --configfile config/silicone.yaml"
+        )
+    return [f"{RESULTS}/stills/{body}.json" for body in RESTING.bodies]
 
 
 def resting_pictures(key):
@@ -43,7 +53,7 @@ rule still_fit:
 
 rule stills_table:
     input:
-        results=expand(f"{RESULTS}/stills/{{body}}.json", body=RESTING.bodies),
+        results=checked(lambda wildcards: resting_results()),
     output:
         csv=f"{RESULTS}/stills.csv",
         markdown=f"{RESULTS}/stills.md",
