@@ -356,7 +356,7 @@ def _result(
     covariance[inner] = np.linalg.inv((fit.curvature + _prior(fit))[inner])
     independent = residuals.visible.sum() * (residuals.weight * _CONTOUR_NOISE) ** 2 + 2 * len(still.marker)
     misfit = max(1.0, cost / max(1.0, independent - len(free) + 3))  # the prior adds three values
-    std: Array = residuals.scales * np.sqrt(misfit * np.diag(covariance))
+    std = np.asarray(residuals.scales * np.sqrt(misfit * np.diag(covariance)), dtype=np.float64)
     distance = residuals.distances(u)[residuals.visible]
     corners = residuals._corners(u)[0] * _MARKER_NOISE
     _, pixels, _ = residuals.surface(u)

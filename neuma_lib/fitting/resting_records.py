@@ -92,7 +92,7 @@ def fit_record(
                 if progress:
                     progress(done, total)
             fits.append(own)
-        clamps[name] = summary(*fits, sizes[0] / sizes[1])
+        clamps[name] = summary(fits[0], fits[1], sizes[0] / sizes[1])
     return {"clamps": clamps, **over_clamps(clamps)}
 
 

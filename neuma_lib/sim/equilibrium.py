@@ -180,7 +180,8 @@ def internal_forces(body: Hexahedra, law: Law, x: Array, pressure: Array | None 
     }
     volume = min(float(np.linalg.det(each).min()) for each in F.values())
     if not volume > 0:
-        return Forces(*(np.empty(0),) * 4, volume)
+        none = np.empty(0)
+        return Forces(none, none, none, none, volume)
     inverse, P, C = _stress(law, F[body.full])
     p, slope = _pressure(F[body.full], P, C)
     spherical, spherical_slope = _spherical(inverse, p, p, slope)

@@ -46,7 +46,7 @@ def data(inputs, params, log) -> ImageGrid:
     return ImageGrid(np.stack([np.stack(row) for row in rows]), tuple(titles), columns)
 
 
-def _filled(lines: list, shape: tuple[int, int]) -> np.ndarray:
+def _filled(lines: list, shape: tuple[int, ...]) -> np.ndarray:
     """Mask (H, W) inside closed lines of (x, y) [px], with holes."""
     result = np.zeros(shape, dtype=bool)
     for line in lines:
