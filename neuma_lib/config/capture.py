@@ -25,6 +25,7 @@ def _inside(name: str) -> str:
 
 Inside = Annotated[str, AfterValidator(_inside)]
 Pixel = tuple[float, float]
+Rectangle = tuple[float, float, float, float]
 
 
 class LengthConfig(Section):
@@ -32,7 +33,8 @@ class LengthConfig(Section):
 
     metres: float = Field(gt=0, description="distance between the points [m]")
     ends: dict[str, tuple[Pixel, Pixel]] = Field(
-        description="photograph -> (x, y) of both points [px], from the upper left corner; in at least two photographs"
+        description="photograph -> (x, y) of both points [px], from the upper left corner as it is displayed; in at "
+        "least two photographs"
     )
 
     @model_validator(mode="after")
@@ -100,6 +102,11 @@ class CaptureConfig(Section):
         "masks",
         description="folder of own masks, `photographs/<photograph>.png` and `<take>/<camera>/<frame>.png`; optional",
     )
+    object: dict[str, Rectangle] = Field(
+        {},
+        description="photograph -> (x0, y0, x1, y1) of a tight box around the whole object [px], from the upper left "
+        "corner as it is displayed; needed if other things stand around the object; one is enough",
+    )
     center: Pixel | None = Field(
         None,
         description="point on the floor at the middle of the simulated box [m], from the lower left corner of the "
@@ -145,6 +152,11 @@ class CaptureConfig(Section):
             raise ValueError(
                 "center: it is a point in the frame of the board, which is not used here; leave it out"
             )
+        for name, (x0, y0, x1, y1) in self.object.items():
+            if x1 - x0 < 8 or y1 - y0 < 8:
+                raise ValueError(
+                    f"object.{name}: expected [left, upper, right, lower] in pixels, 8 apart or more"
+                )
         if self.poses == "board" and self.lens is None:
             raise ValueError("poses: board needs `lens`, a file with the intrinsics of the cameras")
         return self

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -31,6 +32,11 @@ class Similarity:
             self.scale * first.scale, self.rotation @ first.rotation, self.apply(first.translation[None])[0]
         )
 
+    @staticmethod
+    def read(values: Mapping[str, Any]) -> Similarity:
+        """The similarity of `plain`."""
+        return Similarity(values["scale"], np.array(values["rotation"]), np.array(values["translation"]))
+
     def inverse(self) -> Similarity:
         rotation = self.rotation.T
         return Similarity(1 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
@@ -43,6 +49,7 @@ class Similarity:
         return moved
 
     def plain(self) -> dict:
+        """Entries of a file, read by ``Similarity.read``."""
         return {
             "scale": self.scale,
             "rotation": self.rotation.tolist(),

@@ -23,8 +23,8 @@ from neuma_lib.capture.pictures import (
     group_of,
     orientation_of,
     picture_name,
-    picture_size,
     read_picture,
+    sensor_pixels,
     undistorted,
     write_png,
 )
@@ -70,14 +70,9 @@ def find_room(poses: Poses, pictures: Mapping[str, Path], settings: CaptureConfi
     cues = camera_cues(poses.viewmats[held], orientations)
     if settings.poses == "photographs":
         placed = {name: pictures[name] for name in poses.names}
-        for file in settings.length.ends if settings.length else ():
-            name = picture_name(PHOTOGRAPHS, file)
-            size = sizes[held.index(poses.names.index(name))] if name in poses.names else None
-            if size and picture_size(pictures[name]) != size:
-                problem = "the photograph is stored turned, so its pixels are not those of the sensor"
-                raise InputError(f"length.ends.{file}", problem, "Mark the points in other photographs")
         boards = find_boards(placed, settings.board) if settings.board else {}
-        room = room_of(poses, boards, settings, cues)
+        turns = dict(zip((poses.names[i] for i in held), orientations))
+        room = room_of(poses, boards, settings, cues, turns)
     else:
         on_board = settings.poses == "board"
         level = room_from_board(settings.board, settings.center) if on_board else Similarity()
@@ -90,7 +85,11 @@ def find_room(poses: Poses, pictures: Mapping[str, Path], settings: CaptureConfi
 
 
 def room_of(
-    poses: Poses, detections: Mapping[str, Detection], settings: CaptureConfig, cues: Sequence[Cue] = ()
+    poses: Poses,
+    detections: Mapping[str, Detection],
+    settings: CaptureConfig,
+    cues: Sequence[Cue] = (),
+    orientations: Mapping[str, int | None] | None = None,
 ) -> Room:
     """Make poses metric and upright, by the board, else by a known length and a fitted floor.
 
@@ -98,6 +97,7 @@ def room_of(
         poses: of structure from motion.
         detections: corners of the board by picture, unused without a board.
         cues: upward directions in the world of the poses. The first one excludes walls from the search of the floor.
+        orientations: EXIF orientations of photographs by name, for places in their displayed pictures.
 
     Raises:
         InputError: see `fit_board`, `scale_from_length`, `fit_floor`.
@@ -115,19 +115,21 @@ def room_of(
     point, normal, share = fit_floor(poses.points, centres, FLOOR_TOLERANCE * away, settings.seed, *level)
     middle = np.median(poses.points, axis=0)
     level = upright(normal, middle - ((middle - point) @ normal) * normal)
-    scale = _metres_per_unit(poses, settings.length)
+    scale = _metres_per_unit(poses, settings.length, orientations or {})
     room = Similarity(scale).after(level)
     return Room(poses.moved(room), room, floor=share)
 
 
-def _metres_per_unit(poses: Poses, length: LengthConfig) -> float:
+def _metres_per_unit(poses: Poses, length: LengthConfig, orientations: Mapping[str, int | None]) -> float:
     views, directions = [], []
     for file, ends in length.ends.items():
         name = picture_name(PHOTOGRAPHS, file)
         if name in poses.names:
             i = poses.names.index(name)
             views.append(poses.viewmats[i])
-            directions.append(poses.lenses[i].directions(np.array(ends)))
+            lens = poses.lenses[i]
+            marks = sensor_pixels(np.array(ends), orientations.get(name), (lens.width, lens.height))
+            directions.append(lens.directions(marks))
     if len(views) < 2:
         raise InputError(
             "length.ends",
