@@ -150,7 +150,12 @@ def read_capture(folder: str | Path) -> Capture:
     if PHOTOGRAPHS in cameras:
         raise InputError(folder, f"a video camera cannot be named '{PHOTOGRAPHS}'", "Rename its files")
     names = [file.name for file in photographs]
-    marked = {"length.ends": settings.length.ends if settings.length else {}, "object": settings.object}
+    length = settings.length
+    marked = {
+        "length.ends": length.ends if length else (),
+        "length.cameras": length.cameras or () if length else (),
+        "object": settings.object,
+    }
     for key, name in ((key, name) for key, files in marked.items() for name in files):
         if name not in names:
             raise InputError(f"{source}: {key}.{name}", f"no such photograph{hint(name, names)}")

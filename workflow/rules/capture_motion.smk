@@ -80,7 +80,7 @@ rule capture_flight:
     params:
         cameras=TAKE_CAMERAS,
         timing=camera_timing,
-        metric=True,
+        metric=of_capture(lambda capture: capture.settings.metric),
         name="{capture}, {take}",
     script:
         "../scripts/capture_flight.py"

@@ -146,8 +146,9 @@ def marked_photographs(capture):
 
 
 def room_settings(capture):
-    """Settings that the room depends on."""
-    return capture.settings.model_dump(mode="json", exclude={*OF_VIDEOS, "photographs", "masks", "object"})
+    """Settings that the room depends on. A fitted floor is that of the selected object."""
+    unused = {*OF_VIDEOS, "photographs", "masks"} | ({"object"} if capture.settings.board else set())
+    return capture.settings.model_dump(mode="json", exclude=unused)
 
 
 def camera_timing(wildcards):

@@ -167,8 +167,8 @@ def _check(ious, names, is_own, name) -> list[str]:
             name,
             f"{len(doubtful)} of {len(names)} masks of photographs disagree with the others"
             f" ({', '.join(doubtful[:5])}), at most half may",
-            "Photograph the whole object alone in front of a background of another colour, or put masks into the folder"
-            f" masks/{PHOTOGRAPHS}",
+            "Select the object with a box (`object` in capture.yaml), photograph it alone in front of a background of"
+            f" another colour, or put masks into the folder masks/{PHOTOGRAPHS}",
         )
     return doubtful
 

@@ -150,7 +150,7 @@ def selected_masks(
     Raises:
         InputError: a box contains no object, or does not fit the object that the other photographs show.
     """
-    centre, size = _located(viewmats, Ks, boxes, points, seen, name)
+    centre, size = locate(viewmats, Ks, boxes, points, seen, name)
     half = _REACH * size
     ticks = ((np.arange(_VOXELS) + 0.5) / _VOXELS * 2 - 1) * half
     voxels = np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), axis=-1).reshape(-1, 3) + centre
@@ -184,7 +184,7 @@ def selected_masks(
     return masks
 
 
-def _located(
+def locate(
     viewmats: np.ndarray,
     Ks: np.ndarray,
     boxes: Mapping[int, Box],
@@ -194,7 +194,11 @@ def _located(
 ) -> tuple[np.ndarray, float]:
     """Centre (3,) of the object, and half of the longer side of its box, from the points that a boxed photograph shows.
 
-    An object without texture has too few points. Several boxes then triangulate it.
+    An object without texture has too few points. Several boxes then triangulate it. Arguments are those of
+    `selected_masks`.
+
+    Raises:
+        InputError: there are neither enough points nor two boxes.
     """
     centres, sizes, eyes, rays = [], [], camera_centres(viewmats), []
     for i, box in boxes.items():
