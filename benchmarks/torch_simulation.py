@@ -2,21 +2,23 @@
 
 import torch
 
+from neuma_lib.mechanics.catalogue import viscous_branch
 from neuma_lib.sim.clamps import HELD_SHARE, clamped_particles
 from neuma_lib.sim.colliders import CONTACT_STIFFNESS, contact_radius
 from neuma_lib.sim.model import as_regions
 
 
-def step(model, bodies, x, v, F, C, stuck, mass, vol0, time=0.0, clamp=None):
+def step(model, bodies, x, v, F, C, stuck, mass, vol0, time=0.0, clamp=None, over=0.0):
     """One step of the paper's Algorithm 2 with all 27 nodes of a particle as one axis.
 
     Args:
         stuck: tangential displacements of particles in contact [m], shape (N, 3).
         time: of the step [s], for moving colliders and clamps.
         clamp: index of the clamp of each particle, or -1, shape (N,).
+        over: Kirchhoff stress of viscous branches [Pa], shape (N, 3, 3).
     """
     n, dx, dt = model.nodes, model.dx, model.dt
-    tau = evaluate(bodies, "elasticity", F)
+    tau = evaluate(bodies, "elasticity", F) + over
     clamp = torch.full_like(mass, -1) if clamp is None else clamp
     held = [(each, clamp == k) for k, each in enumerate(model.clamps) if each.holds(time, dt)]
     free = ~sum((mine for _, mine in held), start=torch.zeros_like(mass, dtype=torch.bool))
@@ -130,19 +132,48 @@ def evaluate(bodies, part, F):
     return torch.cat([getattr(body.law, part)(F[body.start : body.stop]) for body in bodies])
 
 
+def branch(bodies, F):
+    """Logarithmic strains (N, 3) of the viscous branches without their mean, their axes (N, 3, 3), and the shear moduli
+    and relaxation times of their laws (N, 1)."""
+    values, axes = torch.linalg.eigh(F @ F.mT)
+    log = 0.5 * values.log()
+    constants = [
+        viscous_branch(body.law.viscosity.values) for body in bodies for _ in range(body.start, body.stop)
+    ]
+    G, T = (torch.stack([torch.as_tensor(c[k], dtype=F.dtype) for c in constants])[:, None] for k in (0, 1))
+    return log - log.mean(1, keepdim=True), axes, G, T
+
+
+def overstress(bodies, F):
+    """Kirchhoff stress 2 G dev eps of the branches (N, 3, 3)."""
+    strain, axes, G, _ = branch(bodies, F)
+    return axes @ torch.diag_embed(2 * G * strain) @ axes.mT
+
+
+def relaxed(bodies, F, dt):
+    """F (N, 3, 3) of the branches after an implicit step of the relaxation of their strain."""
+    strain, axes, _, T = branch(bodies, F)
+    return axes @ torch.diag_embed((strain / (1 + dt / T) - strain).exp()) @ axes.mT @ F
+
+
 def rollout(model, law, state, frames, total=False):
     """States (x, v, F, C) of a `State` at the frames, with the total deformation after them if asked for.
 
-    Each has the shape (T, N, ...).
+    Each has the shape (T, N, ...). With a viscous part of all laws, the state has an F_branch.
     """
     bodies = as_regions(law, len(state.x))
     now, stuck, seen = state.motion, torch.zeros_like(state.x), []
     F_total = (state.F,) if total else ()
     clamp = clamped_particles(model.clamps, state.x) if state.clamp is None else state.clamp
+    viscous, F_branch, over = bodies[0].law.viscosity is not None, state.F_branch, 0.0
     for n in range(frames[-1] + 1):
         if n in frames:
             seen.append((*now, *F_total))
         if n < frames[-1]:
-            *now, stuck = step(model, bodies, *now, stuck, state.mass, state.vol0, n * model.dt, clamp)
+            if viscous:
+                over = overstress(bodies, F_branch)
+            *now, stuck = step(model, bodies, *now, stuck, state.mass, state.vol0, n * model.dt, clamp, over)
+            if viscous:
+                F_branch = relaxed(bodies, F_branch + model.dt * now[3] @ F_branch, model.dt)
             F_total = tuple(F + model.dt * now[3] @ F for F in F_total)
     return tuple(torch.stack(values) for values in zip(*seen, strict=True))

@@ -19,6 +19,7 @@ from neuma_lib.config.velocity import VelocityConfig
 from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError
+from neuma_lib.evaluation import calibration
 from neuma_lib.evaluation.metrics import tracer_errors
 from neuma_lib.fitting import identify as identification
 from neuma_lib.fitting.families import FAMILIES, FRICTION
@@ -164,6 +165,9 @@ class Identification:
         ties: families that predict the held-out frames as well.
         contact_friction: ``value`` of the Coulomb coefficient and ``log_std``, the standard deviation of its logarithm,
             or ``at_least`` if the body may stick. Empty if it was not fitted. `MPM.with_friction` applies it.
+        quantities: value of each constant, modulus and ratio, and the standard deviation of its logarithm, with errors
+            that all images share. Empty if it could not be estimated.
+        probabilities: of the families, if the material is of one of them.
     """
 
     law: Law
@@ -172,6 +176,19 @@ class Identification:
     std: dict[str, float]
     ties: tuple[str, ...]
     contact_friction: Mapping[str, float] = field(default_factory=dict)
+    quantities: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    probabilities: Mapping[str, float] = field(default_factory=dict)
+
+    def interval(self, quantity: str, level: float = 0.95) -> tuple[float, float]:
+        """Interval that contains one of ``quantities`` with the probability ``level``, which is at most 0.95.
+
+        Its width was measured on scenes with a known truth (`neuma_lib.evaluation.calibration`).
+
+        Example:
+            >>> identify(scene).interval("E", 0.8)
+            (54000.0, 68000.0)
+        """
+        return calibration.interval(*self.quantities[quantity], level, calibration.GRID)
 
 
 @dataclass(frozen=True)
@@ -269,14 +286,18 @@ def identify(
     video = _video(scene)
     motion = scene.motion or estimate_motion(body, video, scene.mpm)
     result = identification.identify(scene.mpm, motion, body, _of_body(video, body), settings)
-    best, std, friction = result.best, {}, {}
+    best, std, friction, quantities = result.best, {}, {}, {}
     if best.covariance is not None:
         names, covariance = best.log_covariance(lambda constants: constants)
         std = dict(zip(names, np.sqrt(np.diag(covariance)).tolist(), strict=True))
         friction = best.contact_friction(settings)
+        quantities = {key: (value, log_std) for key, value, log_std in best.quantities(settings)}
     law = Law.from_spec(best.family.law_spec(best.values), scene.mpm.dt)
     constants, std = ({k: v for k, v in values.items() if k != FRICTION} for values in (best.values, std))
-    return Identification(law, best.family.name, constants, std, tuple(result.ties), friction)
+    probabilities = calibration.family_probabilities(result.as_dict())
+    return Identification(
+        law, best.family.name, constants, std, tuple(result.ties), friction, quantities, probabilities
+    )
 
 
 def adapt(law: Law, scene: Scene, options: Mapping[str, Any] | None = None) -> Adaptation:
@@ -315,7 +336,7 @@ def adapt(law: Law, scene: Scene, options: Mapping[str, Any] | None = None) -> A
     if isinstance(law, StructuredLaw):
         corrected = copy.deepcopy(law)
     else:
-        spec = {**specification(law.elasticity, law.plasticity), "form": settings.form}
+        spec = {**specification(law.elasticity, law.plasticity, law.viscosity), "form": settings.form}
         corrected = structured_law(spec, scene.mpm.dt, seed=settings.seed)
     corrected.attach_adaptor(settings.rank, settings.alpha, settings.seed)
     problem = _start_and_loss(scene, settings)

@@ -87,6 +87,9 @@ def test_a_material_is_identified(scene):
     material = nm.identify(scene, families, options)
     assert material.family == "hencky" and material.ties == () and set(material.std) == {"E", "nu"}
     assert material.contact_friction == {}
+    low, high = material.interval("E", 0.8)
+    assert low < material.constants["E"] < high and material.interval("E", 0.95)[1] > high
+    assert {"G", "K"} <= set(material.quantities) and material.probabilities == {"hencky": 1.0}
     assert material.constants["E"] == pytest.approx(1.5e4, rel=0.1)
     assert float(material.law.elasticity.values["E"]) == material.constants["E"]
     with refused("options.particles"):

@@ -2,22 +2,34 @@
 
 from __future__ import annotations
 
-from pydantic import ConfigDict, Field
+from typing import Any
+
+from pydantic import ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
 
 from neuma_lib.config.base import Constant, Section
 
 
 class LawPart(Section):
-    """One of the two parts of a law: its name, and its constants in SI units by name."""
+    """One of the parts of a law: its name, and its constants in SI units by name."""
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, Constant]
 
-    name: str = Field(description="name of the elastic law or the return map")
+    name: str = Field(description="name of the elastic law, the return map or the viscous part")
 
 
 class LawConfig(Section):
-    """An analytic material: elastic law and return map."""
+    """An analytic material: elastic law, return map and viscous part."""
 
     elasticity: LawPart = Field(description="elastic law and its constants, for example E [Pa] and nu")
     plasticity: LawPart = Field(LawPart(name="identity"), description="return map and its constants")
+    viscosity: LawPart | None = Field(
+        None,
+        description="viscous part in shear and its constants: `kelvin_voigt` with viscosity [Pa s], or `maxwell` with "
+        "modulus [Pa] and relaxation [s]",
+    )
+
+    @model_serializer(mode="wrap")
+    def _without_missing_parts(self, serialise: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """A law without a viscous part has no such key, as in files that were written before there was one."""
+        return {key: value for key, value in serialise(self).items() if value is not None}

@@ -2,7 +2,9 @@
 
 **Constants.** An identified family has a covariance of its unbounded constants (`neuma_lib.fitting.families`). Laws are
 sampled from that normal distribution, with the error that all images share (`identify.model_std`) added. Families that
-tie with the best one get equal parts of the samples. Such a band is correct if the truth belongs to one of them.
+tie with the best one get equal parts of the samples. Such a band is correct if the truth belongs to one of them. Errors
+are not normal, so a band is the central interval of the samples with the probability that `calibration.Quantiles`
+measured for its level.
 
 **A structured correction** (`neuma_lib.mechanics.structured`) multiplies moduli m_a by exp(n_a(z)), with invariants z
 of the elastic strain. Deviations g_a(z) of the n_a are sampled from a Gaussian process:
@@ -34,6 +36,7 @@ import torch
 from torch import Tensor
 
 from neuma_lib.errors import InputError
+from neuma_lib.evaluation.calibration import GRID, SHOWN, quantiles_of
 from neuma_lib.fitting.families import Family
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.elasticity import STRETCH_MIN
@@ -49,8 +52,8 @@ from neuma_lib.mechanics.structured import (
     invariants,
     structured_law,
 )
+from neuma_lib.sim.model import MPM
 
-COVERED = 0.95
 DRAWS = 100
 SILENT = LIMIT / 2
 """Standard deviation of the deviation of a log-modulus in states without data."""
@@ -67,7 +70,15 @@ Band = tuple[np.ndarray, np.ndarray]
 
 
 def constants_draws(
-    identified: Mapping[str, Any], model_std: float, dt: float, count: int, seed: int
+    identified: Mapping[str, Any],
+    model_std: float,
+    dt: float,
+    count: int,
+    seed: int,
+    *,
+    of: str = "best",
+    covariance: str = "covariance",
+    stable_in: tuple[MPM, float] | None = None,
 ) -> list[Law]:
     """Sample laws of the family in an identified.json, and of those that tie with it.
 
@@ -76,15 +87,19 @@ def constants_draws(
         model_std: standard deviation of every unbounded constant in addition to that from the images.
         dt: time step [s].
         count: approximate number of laws, divided equally among the families.
+        of: its entry with the constants, "best" or "material".
+        covariance: "covariance", or "laplace" for the Laplace approximation.
+        stable_in: simulator and density [kg/m^3] that limit the stiffness, as in the fit.
     """
     generator = np.random.default_rng(seed)
-    fits = [identified["best"], *(identified["families"][name] for name in identified["ties"])]
+    fits = [identified[of], *(identified["families"][name] for name in identified["ties"])]
     each, laws = -(-count // len(fits)), []
     for fit in fits:
         family = Family("drawn", fit["law"])
-        covariance = np.array(fit["unbounded"]["covariance"]) + model_std**2 * np.eye(len(family.constants))
-        draws = generator.multivariate_normal(fit["unbounded"]["values"], covariance, each)
-        laws += [analytic_law(family.law_spec(family.bounded(u)), dt) for u in draws]
+        spread = np.array(fit["unbounded"][covariance]) + model_std**2 * np.eye(len(family.constants))
+        for u in generator.multivariate_normal(fit["unbounded"]["values"], spread, each):
+            values = family.values(u, *stable_in) if stable_in else family.bounded(u)
+            laws.append(analytic_law(family.law_spec(values), dt))
     return laws
 
 
@@ -202,14 +217,19 @@ def _deviating(law: StructuredLaw, field: RandomField, rows: Mapping[Output, Ten
     return Law(elasticity, plasticity)
 
 
-def band(laws: Sequence[Law], curve: Callable[[Law], Tensor]) -> Band:
-    """Lower and upper end (P,) of the central interval that contains `COVERED` of the curves (P,) at each point.
+def band(laws: Sequence[Law], curve: Callable[[Law], Tensor], inside: float | None = None) -> Band:
+    """Lower and upper end (P,) of a central interval of the curves (P,) of sampled laws at each point.
 
     Non-finite values are ignored.
+
+    Args:
+        inside: share of the curves in the interval. None: that of the calibrated interval of constants on the grid at
+            the level `calibration.SHOWN`.
     """
+    inside = quantiles_of(GRID).nominal(SHOWN) if inside is None else inside
     curves = np.stack([curve(law).numpy() for law in laws])
     curves[~np.isfinite(curves)] = np.nan
-    low, high = np.nanquantile(curves, [(1 - COVERED) / 2, (1 + COVERED) / 2], axis=0)
+    low, high = np.nanquantile(curves, [(1 - inside) / 2, (1 + inside) / 2], axis=0)
     return low, high
 
 

@@ -10,11 +10,10 @@ import numpy as np
 
 from neuma_lib.errors import InputError
 from neuma_lib.mechanics.analytic import analytic_law
-from neuma_lib.mechanics.catalogue import ELASTICITY, PLASTICITY, POISSON, Constant
+from neuma_lib.mechanics.catalogue import PARTS, POISSON, Constant
 from neuma_lib.mechanics.combinations import Values
 from neuma_lib.sim.model import MPM
 
-_PARTS = {"elasticity": ELASTICITY, "plasticity": PLASTICITY}
 FRICTION = "contact_friction"
 """Name of the Coulomb coefficient of a body and its obstacles, a constant that belongs to no law."""
 _FRICTION_GUESS = 0.5
@@ -65,24 +64,27 @@ class Family:
         self._constants: dict[str, tuple[str, Constant]] = {}
         self.guess: Values = {}
         analytic_law(spec, dt=1.0, name=name)  # checks names and ranges
-        for part, known in _PARTS.items():
-            given = spec.get(part) or {"name": "identity"}
+        for part, known in PARTS.items():
+            given = {key: value for key, value in (spec.get(part) or {}).items() if key != "name"}
+            if twice := set(given) & set(self.guess) - {"E", "nu", "dt"}:
+                problem = f"{', '.join(twice)} is a constant of the plasticity as well"
+                raise InputError(f"identify.families.{name}.{part}", problem, "Use another viscous part")
             for key, value in given.items():
-                if key != "name":
-                    self._constants[key] = (part, known[given["name"]][key])
-                    self.guess[key] = float(value)
+                self._constants[key] = (part, known[spec[part]["name"]][key])
+                self.guess[key] = float(value)
         if contact_friction:
             self._constants[FRICTION], self.guess[FRICTION] = ("", Constant("1", 0.0)), _FRICTION_GUESS
         self.constants = tuple(self.guess)
-        if own := {"E", "nu", "dt"} & set(spec.get("plasticity") or ()):
-            raise InputError(
-                f"identify.families.{name}.plasticity",
-                f"{', '.join(sorted(own))} must not be set, since the elasticity and the scene define it",
-            )
+        for part in ("plasticity", "viscosity"):
+            if own := {"E", "nu", "dt"} & set(spec.get(part) or ()):
+                raise InputError(
+                    f"identify.families.{name}.{part}",
+                    f"{', '.join(sorted(own))} must not be set, since the elasticity and the scene define it",
+                )
 
     def contains(self, other: Family) -> bool:
         """Whether the other family, with fewer constants, is a limit of this one."""
-        flows = self.return_map in ("von_mises", "viscous_flow")
+        flows = self.return_map in ("von_mises", "viscous_flow") or self._viscous
         same = self.spec["elasticity"]["name"] == other.spec["elasticity"]["name"]
         return flows and same and set(other.constants) < set(self.constants)
 
@@ -91,8 +93,15 @@ class Family:
         return np.array([self._unbounded(key, values[key]) for key in self.constants])
 
     def values(self, unbounded: np.ndarray, model: MPM, density: float) -> Values:
-        """Constants from unbounded ones, with E limited at a density [kg/m^3] by `MAX_COURANT`."""
+        """Constants from unbounded ones, with E and the viscous part limited at a density [kg/m^3] by `MAX_COURANT`."""
         values = self.bounded(unbounded)
+        if self._viscous:
+            number = model.courant(analytic_law(self.law_spec(values), model.dt), density)
+            softer = min(1.0, (MAX_COURANT / number) ** 2)
+            return {
+                key: value * softer if key in ("E", *self._viscous) else value
+                for key, value in values.items()
+            }
         unit = analytic_law(self.law_spec({**values, "E": 1.0}), model.dt)
         stiffest = (MAX_COURANT / model.courant(unit, density)) ** 2
         return {**values, "E": min(values["E"], stiffest)}
@@ -135,13 +144,27 @@ class Family:
     @property
     def flows(self) -> bool:
         """Whether it has constants that limit plastic flow."""
-        return any(key not in _NO_FLOW for key in self.constants)
+        return bool(self._flow)
 
     def with_other_limits(self, values: Values, powers: Sequence[int]) -> list[Values]:
         """Values with constants of plastic flow times 4 to each power (in logarithms or logits); none if elastic."""
-        flow = np.array([key not in _NO_FLOW for key in self.constants])
+        flow = np.array([key in self._flow for key in self.constants])
         u = self.unbounded(values)
         return [self.bounded(u + math.log(4) * n * flow) for n in powers] if self.flows else []
+
+    @property
+    def _flow(self) -> tuple[str, ...]:
+        """Constants that limit plastic flow: those of the plasticity and, as E and nu, others of the elasticity."""
+        return tuple(
+            key for key in self.constants if key not in _NO_FLOW and self._constants[key][0] != "viscosity"
+        )
+
+    @property
+    def _viscous(self) -> tuple[str, ...]:
+        """Constants of the viscous part to which its stress is proportional."""
+        return tuple(
+            key for key, (part, _) in self._constants.items() if part == "viscosity" and key != "relaxation"
+        )
 
     def _bounds(self, key: str) -> tuple[float, float]:
         constant = self._constants[key][1]

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from neuma_lib.config.identify import IdentifyConfig
 from neuma_lib.coupling.initial_motion import InitialMotion
+from neuma_lib.errors import NonFiniteError
 from neuma_lib.fitting.families import FRICTION, Family
 from neuma_lib.fitting.identified import FamilyFit
 from neuma_lib.fitting.least_squares import (
@@ -22,6 +23,7 @@ from neuma_lib.fitting.least_squares import (
     Linearisation,
     block_sums,
     jackknife,
+    laplace,
     levenberg_marquardt,
     secant_update,
 )
@@ -130,11 +132,15 @@ class FamilyRun:
                 self._columns, self._exact = {self._u.tobytes(): similar[0].columns}, False
             self.refine(level, **how)
 
-    def restart_from(self, values: Values) -> None:
-        """Continue from the constants of another family if they have a lower cost."""
-        unknowns = np.append(self.family.unbounded(values) - self._origin, self._u[self._constants :])
-        if self.cost(unknowns) < self.fit.cost:
-            self._u = unknowns
+    def restart_from(self, starts: Sequence[Values]) -> None:
+        """Continue from the best of some constants if it has a lower cost."""
+        deviations = self._u[self._constants :]
+        points = [np.append(self.family.unbounded(start) - self._origin, deviations) for start in starts]
+        residuals = self._simulate(points)
+        costs = [math.inf if residual is None else self._cost(residual) for residual in residuals]
+        best = int(np.argmin(costs))
+        if costs[best] < self.fit.cost:
+            self._u, self._images = points[best], {points[best].tobytes(): residuals[best]}
             self.refine(self._level)
 
     def refine(self, level: int, rough: bool = False, limit: float = math.inf) -> None:
@@ -180,6 +186,37 @@ class FamilyRun:
         for v, video in enumerate(self.videos):
             video.differentiate(self._candidate(self._u, v))
 
+    def linearise_at(self, values: Values) -> Linearisation:
+        """The problem at the last level, linearised at constants and the estimated motions without a fit.
+
+        Raises:
+            NonFiniteError: the rollout diverges.
+        """
+        self._origin, self._level = self.family.unbounded(values), len(self.settings.pyramid) - 1
+        if not math.isfinite(self.cost(self._u)):
+            raise NonFiniteError(self.family.name, "the simulation with the identified constants diverges")
+        if any(video.by_deviation is None for video in self.videos):
+            self.differentiate()
+        return self.linearise(self._u, self._free)
+
+    def imitate(self, values: Values, noise: float) -> None:
+        """Fit at the last level from constants, with a known variance of the residuals per unit of curvature.
+
+        Raises:
+            NonFiniteError: the rollout diverges.
+        """
+        self.linearise_at(values)
+        P = np.diag(noise / self._spreads**2)
+        self._u, self.fit, _ = levenberg_marquardt(
+            self,
+            self._u,
+            self._free,
+            lambda fit: P,
+            self.settings.min_gain,
+            self.settings.iterations,
+            longest=self.settings.longest_step,
+        )
+
     def score(self) -> FamilyFit:
         """The result of the fit, evaluated on the held-out frames if any."""
         result = FamilyFit(self.family, self.values, self.loss, refined=self.refined, steps=self.steps)
@@ -187,6 +224,7 @@ class FamilyRun:
             k = self._constants
             covariance = self._covariance()
             result.covariance, stds = covariance[:k, :k], np.sqrt(np.diag(covariance))
+            result.laplace = laplace(self.fit, self._spreads)[:k, :k]
             result.motions = tuple(self._motion(v, stds) for v in range(len(self.videos)))
             if any(count < len(video.frames) for count, video in zip(self.counts, self.videos, strict=True)):
                 result.held_out = self._held_out()

@@ -29,6 +29,7 @@ class FamilyFit:
         held_out: mean squared residual of the held-out frames at the finest level.
         score: logarithm of ``held_out`` plus the penalty on constants; lower is better.
         covariance: covariance (k, k) of the unbounded constants, including the uncertainty of the initial motions.
+        laplace: the same by the Laplace approximation, with independent pixels: inverse curvature times ``loss``.
         motions: fitted initial motion in each video, with its standard deviations.
         refined: whether the fit reached the finest level.
         rollouts: number of simulations.
@@ -42,6 +43,7 @@ class FamilyFit:
     held_out: float = math.inf
     score: float = math.inf
     covariance: np.ndarray | None = None
+    laplace: np.ndarray | None = None
     motions: tuple[InitialMotion, ...] = ()
     refined: bool = False
     rollouts: int = 0
@@ -91,8 +93,14 @@ class FamilyFit:
         second *= _ASYMPTOTIC / np.maximum(np.abs(change), _ASYMPTOTIC)
         return replace(self, values=self.family.bounded(u(self.values) + second), covariance=covariance)
 
-    def log_covariance(self, of: Callable[[Values], Values]) -> tuple[list[str], np.ndarray]:
-        """Names (m,) and covariance (m, m) of logarithms of positive functions of the constants, to first order."""
+    def log_covariance(
+        self, of: Callable[[Values], Values], covariance: np.ndarray | None = None
+    ) -> tuple[list[str], np.ndarray]:
+        """Names (m,) and covariance (m, m) of logarithms of positive functions of the constants, to first order.
+
+        Args:
+            covariance: of the unbounded constants (k, k). None: ``self.covariance``.
+        """
         u, h = self.family.unbounded(self.values), 1e-4
         names = list(of(self.values))
 
@@ -100,7 +108,7 @@ class FamilyFit:
             return np.log(list(of(self.family.bounded(point)).values()))
 
         slope = np.stack([(logs(u + h * e) - logs(u - h * e)) / (2 * h) for e in np.eye(len(u))], axis=1)
-        return names, slope @ self.covariance @ slope.T
+        return names, slope @ (self.covariance if covariance is None else covariance) @ slope.T
 
     def as_dict(self, settings: IdentifyConfig) -> dict[str, Any]:
         """Plain numbers for JSON."""
@@ -123,6 +131,12 @@ class FamilyFit:
             }
             plain["combinations"] = self.combinations(settings)
             plain["unbounded"] = self.family.unbounded_dict(self.values, self.covariance)
+            if self.laplace is not None:
+                names, covariance = self.log_covariance(named_combinations, self.laplace)
+                for key, std in zip(names, np.sqrt(np.diag(covariance)), strict=True):
+                    plain["quantities"][key]["laplace_log_std"] = float(std)
+                own = len(plain["unbounded"]["constants"])
+                plain["unbounded"]["laplace"] = self.laplace[:own, :own].tolist()
             plain["start"] = self.motions[0].as_dict()
         return plain
 
@@ -157,6 +171,7 @@ class Identified:
     Attributes:
         best: the selected family, fitted to all frames on the grid of the simulation. It predicts on that grid.
         ties: names of other families with an equal score.
+        compared: names of the families whose scores are compared, which all have the same grid.
         fits: all candidates at their evaluation, by name, on the finer grid where families were compared there.
         frames: steps of the fitted frames of each video.
         held_out: steps of the held-out frames of each video.
@@ -175,6 +190,7 @@ class Identified:
     grid: int
     settings: IdentifyConfig = field(repr=False)
     material: FamilyFit | None = None
+    compared: Sequence[str] = ()
 
     def as_dict(self) -> dict[str, Any]:
         """Plain numbers for JSON; ``law`` is a specification for `analytic_law`.
@@ -190,6 +206,7 @@ class Identified:
             "family": self.best.family.name,
             "grid": self.grid,
             "ties": self.ties,
+            "compared": list(self.compared),
             "law": self.best.family.law_spec(self.best.values),
             **({FRICTION: friction} if friction else {}),
             "says": self.summary(),

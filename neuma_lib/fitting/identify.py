@@ -55,6 +55,7 @@ from neuma_lib.sim.model import MPM
 from neuma_lib.splatting.observation import Observation, joint_frames, several
 
 _CONTENDERS = 3  # families that are compared on the finer grid
+_OTHER_LIMITS = (-2, -1, 1, 2)  # powers of 4 of the limits of a flow that restarts near another family
 
 
 def identify(
@@ -121,7 +122,8 @@ def identify(
         else:
             running.append(_first_fit(family, videos, running, published_values, settings))
     for run, best in _better_later(running):
-        run.restart_from(run.family.with_guesses({**run.values, **best.values}))
+        start = run.family.with_guesses({**run.values, **best.values})
+        run.restart_from([start, *run.family.with_other_limits(start, _OTHER_LIMITS)])
     total = rounds * len(families)
     for level in range(1, rounds):
         _prune(running, settings, keep_redundant=bool(refined))
@@ -191,6 +193,7 @@ def identify(
         model.grid,
         settings,
         material,
+        [fit.family.name for fit in compared.values() if math.isfinite(fit.score)],
     )
 
 

@@ -50,7 +50,7 @@ FORMS: dict[str, Any] = {
     "velocity.json": {**_MOTION, "bodies": [_MOTION]},
     "identified.json": {
         **_FIT, "best": _FIT, "material": _FIT, "families": {"*": _FIT},
-        "start": _MOTION, "grid": int, "family": str, "ties": [str],
+        "start": _MOTION, "grid": int, "family": str, "ties": [str], "compared": [str],
     },
     "constants.json": _FIT,
     **dict.fromkeys(("metrics.json", "gaussians.json", "history.json"), {}),

@@ -12,6 +12,7 @@ from neuma_lib.mechanics.catalogue import complete
 from neuma_lib.mechanics.elasticity import ELASTICITIES
 from neuma_lib.mechanics.law import Elasticity, Law, Plasticity
 from neuma_lib.mechanics.plasticity import PLASTICITIES
+from neuma_lib.mechanics.viscosity import VISCOSITIES, Viscosity
 
 
 def analytic_law(spec: Mapping[str, Any], dt: float | None = None, name: str | None = None) -> Law:
@@ -21,9 +22,9 @@ def analytic_law(spec: Mapping[str, Any], dt: float | None = None, name: str | N
     "yield_stress": 5e3}}``
 
     Args:
-        spec: the two parts, each with its ``name`` and constants. A plasticity inherits E and nu from the elasticity
-            by default. A missing plasticity is the identity.
-        dt: time step [s], required by rate-dependent plasticity (with the constant ``dt``).
+        spec: the parts, each with its ``name`` and constants. A plasticity inherits E and nu from the elasticity
+            by default. A missing plasticity is the identity. A ``viscosity`` is optional.
+        dt: time step [s], required by rate-dependent parts (with the constant ``dt``).
         name: name used in messages, by default composed of the names of the parts.
 
     Raises:
@@ -31,22 +32,29 @@ def analytic_law(spec: Mapping[str, Any], dt: float | None = None, name: str | N
     """
     parts = complete(spec, dt)
     names = [part.pop("name") for part in parts.values()]
-    elasticity = ELASTICITIES[names[0]](**parts["elasticity"])
-    return Law(elasticity, PLASTICITIES[names[1]](**parts["plasticity"]), name or " + ".join(names))
+    kinds = (ELASTICITIES, PLASTICITIES, VISCOSITIES)
+    elasticity, plasticity, *viscosity = (
+        known[own](**values) for known, own, values in zip(kinds, names, parts.values(), strict=False)
+    )
+    return Law(elasticity, plasticity, name or " + ".join(names), *viscosity)
 
 
-def name_of(part: Elasticity | Plasticity) -> str | None:
+def name_of(part: Elasticity | Plasticity | Viscosity) -> str | None:
     """Name of an analytic part in specifications, None if it has none."""
     return next((name for name, kind in part.named.items() if kind is type(part)), None)
 
 
-def specification(elasticity: Elasticity, plasticity: Plasticity) -> dict[str, Any]:
-    """Complete specification of two analytic parts, including inherited constants of the plasticity (E, nu, dt).
+def specification(
+    elasticity: Elasticity, plasticity: Plasticity, viscosity: Viscosity | None = None
+) -> dict[str, Any]:
+    """Complete specification of analytic parts, including inherited constants (E, nu, dt).
 
     Raises:
         InputError: a part has no name or does not hold constants, so that a specification cannot describe it.
     """
     parts = {"elasticity": elasticity, "plasticity": plasticity}
+    if viscosity is not None:
+        parts["viscosity"] = viscosity
     for key, part in parts.items():
         if name_of(part) is None or not hasattr(part, "values"):
             problem = f"{type(part).__name__} is not described by a name and constants"

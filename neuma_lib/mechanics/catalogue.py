@@ -1,8 +1,9 @@
 """The built-in analytic laws: names, constants, units and bounds. Imports no torch, so that settings can be checked
 before it is loaded.
 
-A specification has the two parts ``elasticity`` and ``plasticity``, each with its ``name`` and constants:
-``{"elasticity": {"name": "hencky", "E": 3e5, "nu": 0.25}, "plasticity": {"name": "von_mises", "yield_stress": 5e3}}``
+A specification has the parts ``elasticity`` and optionally ``plasticity`` and ``viscosity``, each with its ``name`` and
+constants: ``{"elasticity": {"name": "hencky", "E": 3e5, "nu": 0.25}, "plasticity": {"name": "von_mises",
+"yield_stress": 5e3}}``
 """
 
 from __future__ import annotations
@@ -112,6 +113,16 @@ PLASTICITY: dict[str, dict[str, Constant]] = {
 """Constants of the return maps by name. E, nu and dt default to those of the elasticity and of the simulation."""
 
 
+VISCOSITY: dict[str, dict[str, Constant]] = {
+    "kelvin_voigt": {"viscosity": Constant("Pa s", 0.0), "dt": _STEP},
+    "maxwell": {"modulus": Constant("Pa", 0.0), "relaxation": Constant("s", 0.0), "dt": _STEP},
+}
+"""Constants of the viscous parts by name. dt defaults to that of the simulation."""
+
+PARTS = {"elasticity": ELASTICITY, "plasticity": PLASTICITY, "viscosity": VISCOSITY}
+"""Constants of all laws by part and name."""
+
+
 DEFINED_IN: dict[tuple[str, str], str] = {}
 """Modules or Python files of laws that are not built in, by part and name."""
 
@@ -137,18 +148,21 @@ def register(part: str, name: str, constants: Mapping[str, Constant], module: st
 
 
 def complete(spec: Mapping[str, Any], dt: float | None = None) -> dict[str, dict[str, Any]]:
-    """A specification with both parts, and E, nu and dt in a plasticity that has these constants.
+    """A specification with elasticity and plasticity, E and nu in a plasticity that has these constants, and dt in
+    parts that have it. A viscosity is a part of the result if one is given.
 
     Args:
         spec: a plasticity inherits E and nu from the elasticity by default. A missing plasticity is the identity.
-        dt: time step [s], required by a plasticity with the constant ``dt``.
+        dt: time step [s], required by parts with the constant ``dt``.
 
     Raises:
         InputError: a part or its name is unknown or missing, or the time step is. Constants are not checked.
     """
-    if "elasticity" not in spec or not set(spec) <= {"elasticity", "plasticity"}:
+    if "elasticity" not in spec or not set(spec) <= set(PARTS):
         keys = ", ".join(map(str, spec)) or "none"
-        raise InputError("law", f"its keys must be elasticity and optionally plasticity, not {keys}")
+        raise InputError(
+            "law", f"its keys must be elasticity and optionally plasticity and viscosity, not {keys}"
+        )
     elastic = dict(spec["elasticity"])
     plastic = dict(spec.get("plasticity") or {"name": "identity"})
     _known_name("elasticity", elastic, ELASTICITY)
@@ -156,11 +170,16 @@ def complete(spec: Mapping[str, Any], dt: float | None = None) -> dict[str, dict
     for key in MODULI:
         if key in needed and key in elastic:
             plastic.setdefault(key, elastic[key])
-    if "dt" in needed and "dt" not in plastic:
-        if dt is None:
-            raise InputError("dt", f"plasticity {plastic['name']} is rate-dependent and needs the time step")
-        plastic["dt"] = dt
-    return {"elasticity": elastic, "plasticity": plastic}
+    parts = {"elasticity": elastic, "plasticity": plastic}
+    if spec.get("viscosity"):
+        parts["viscosity"] = dict(spec["viscosity"])
+        _known_name("viscosity", parts["viscosity"], VISCOSITY)
+    for part, own in parts.items():
+        if "dt" in PARTS[part][own["name"]] and "dt" not in own:
+            if dt is None:
+                raise InputError("dt", f"{part} {own['name']} is rate-dependent and needs the time step")
+            own["dt"] = dt
+    return parts
 
 
 def check_law(spec: Mapping[str, Any], dt: float | None = None) -> dict[str, dict[str, Any]]:
@@ -169,11 +188,10 @@ def check_law(spec: Mapping[str, Any], dt: float | None = None) -> dict[str, dic
     Raises:
         InputError: what `complete` refuses, or a constant is unknown, missing, no number or outside its interval.
     """
-    parts = complete(spec, dt)
     checked = {}
-    for part, known in (("elasticity", ELASTICITY), ("plasticity", PLASTICITY)):
-        name = parts[part].pop("name")
-        checked[part] = {"name": name, **check_constants(part, known[name], parts[part])}
+    for part, own in complete(spec, dt).items():
+        name = own.pop("name")
+        checked[part] = {"name": name, **check_constants(part, PARTS[part][name], own)}
     return checked
 
 
@@ -214,6 +232,31 @@ def check_constants(
 def lame(E, nu):
     """Lamé parameters mu, lam [Pa] of Young's modulus E [Pa] and Poisson's ratio nu, numbers or tensors."""
     return E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu))
+
+
+def viscous_branch(values):
+    """Shear modulus [Pa] and relaxation time [s] of the branch of a `VISCOSITY`, numbers or tensors.
+
+    Args:
+        values: its constants, dt included.
+    """
+    if "modulus" in values:
+        return values["modulus"], values["relaxation"]
+    return values["viscosity"] / values["dt"], values["dt"]
+
+
+def viscous_stiffness(values: Mapping[str, float]) -> float:
+    """What a viscous part adds to the longitudinal modulus in the limit of the time step [Pa].
+
+    In the fastest vibration that the steps of length dt can have, the sign changes with every step. The strain of a
+    spring of modulus G that relaxes by the factor a = 1 / (1 + dt / T) in a step is then 2 a / (1 + a) times that of
+    the body, so that it acts as one of modulus G / (1 + dt / (2 T)).
+
+    Args:
+        values: constants of a `VISCOSITY`, dt included.
+    """
+    modulus, relaxation = viscous_branch(values)
+    return 4 / 3 * modulus / (1 + values["dt"] / (2 * relaxation))
 
 
 def longitudinal_modulus(elasticity: Mapping[str, Any]) -> float:

@@ -42,7 +42,7 @@ def _volume_ratio(sigma: Tensor) -> Tensor:
     return (sigma[:, 0] * sigma[:, 1] * sigma[:, 2])[:, None]
 
 
-def _isochoric_strain(sigma: Tensor) -> tuple[Tensor, Tensor]:
+def isochoric_strain(sigma: Tensor) -> tuple[Tensor, Tensor]:
     """Logarithms (N, 3) of the isochoric stretches sigma J^(-1/3), and log J (N, 1)."""
     strain = sigma.clamp(min=STRETCH_MIN).log()
     log_J = strain.sum(1, keepdim=True)
@@ -131,7 +131,7 @@ class Tait(AnalyticElasticity, name="tait"):
         return 2 * mu, (lam + 2 * mu / 3) / 7
 
     def principal(self, sigma, mu, lam):
-        strain, _ = _isochoric_strain(sigma)
+        strain, _ = isochoric_strain(sigma)
         J = _volume_ratio(sigma).clamp(min=STRETCH_MIN)
         return (lam + 2 * mu / 3) / 7 * (J - J**-6) + 2 * mu * strain
 
@@ -151,7 +151,7 @@ class Ogden(AnalyticElasticity, name="ogden"):
         return 2 * mu / alpha, alpha, lam + 2 * mu / 3
 
     def principal(self, sigma, mu, lam, alpha):
-        strain, log_J = _isochoric_strain(sigma)
+        strain, log_J = isochoric_strain(sigma)
         return 2 * mu / alpha * _deviator((alpha * strain).exp()) + (lam + 2 * mu / 3) * log_J
 
 
@@ -171,7 +171,7 @@ class MooneyRivlin(AnalyticElasticity, name="mooney_rivlin"):
         return mu * (1 - q), mu * q, lam + 2 * mu / 3
 
     def principal(self, sigma, mu, lam, q):
-        strain, log_J = _isochoric_strain(sigma)
+        strain, log_J = isochoric_strain(sigma)
         shear = (1 - q) * _deviator((2 * strain).exp()) - q * _deviator((-2 * strain).exp())
         return mu * shear + (lam + 2 * mu / 3) * log_J
 

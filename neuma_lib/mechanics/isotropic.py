@@ -157,6 +157,11 @@ class Constants(nn.Module):
     constants: dict[str, Constant] = {}
     part: str
 
+    @property
+    def kernel_name(self) -> str:
+        """Name of the law in `analytic_kernels.LAWS`."""
+        return type(self).__name__
+
     def __init__(self, **values: float | Tensor):
         super().__init__()
         plain = {key: value.detach() if isinstance(value, Tensor) else value for key, value in values.items()}
@@ -195,7 +200,7 @@ class Constants(nn.Module):
             key: torch.as_tensor(x, dtype=torch.float64, device=device).reshape(())
             for key, x in values.items()
         }
-        return kernels.row(type(self).__name__, self.coefficients(**tensors))
+        return kernels.row(self.kernel_name, self.coefficients(**tensors))
 
     @property
     def native_rows(self) -> bool:
@@ -203,7 +208,7 @@ class Constants(nn.Module):
 
     @property
     def keeps_singular_values(self) -> bool:
-        return self.native and type(self).__name__ not in kernels.WITHOUT_SINGULAR_VALUES
+        return self.native and self.kernel_name not in kernels.WITHOUT_SINGULAR_VALUES
 
     @property
     def loops(self) -> bool:

@@ -14,13 +14,16 @@ from collections.abc import Hashable, Mapping
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
 
 from neuma_lib.errors import NonFiniteError
-from neuma_lib.mechanics.catalogue import register
+from neuma_lib.mechanics.catalogue import register, viscous_stiffness
+
+if TYPE_CHECKING:
+    from neuma_lib.mechanics.viscosity import Viscosity
 
 Weights = tuple[Tensor, ...]
 AdjointPrecision = Literal["single", "half"]
@@ -172,28 +175,37 @@ class Plasticity(Constitutive):
 
 
 class Law(nn.Module):
-    """A material model: elasticity and plasticity, with a name for messages.
+    """A material model: elasticity and plasticity, with a name for messages, and optionally a viscous part.
 
     Attributes:
+        viscosity: spring and dashpot parallel to the elasticity (`neuma_lib.mechanics.viscosity`), or None.
         grid: cells along the unit cube of the simulation that it was learned in, whose discretisation error it has
             absorbed; None if it does not depend on a grid. Simulations on another grid warn.
     """
 
     grid: int | None = None
 
-    def __init__(self, elasticity: Elasticity, plasticity: Plasticity, name: str = "law"):
+    def __init__(
+        self,
+        elasticity: Elasticity,
+        plasticity: Plasticity,
+        name: str = "law",
+        viscosity: Viscosity | None = None,
+    ):
         super().__init__()
         self.elasticity = elasticity
         self.plasticity = plasticity
         self.name = name
+        self.viscosity = viscosity
 
     @classmethod
     def from_spec(cls, spec: Mapping[str, Any], dt: float | None = None) -> Law:
         """An analytic law from the names and constants of its parts (`analytic_law`).
 
         Args:
-            spec: ``elasticity`` and optionally ``plasticity``, each with its ``name`` and constants in SI units.
-            dt: time step of the simulation [s], required by rate-dependent plasticity.
+            spec: ``elasticity`` and optionally ``plasticity`` and ``viscosity``, each with its ``name`` and constants
+                in SI units.
+            dt: time step of the simulation [s], required by rate-dependent parts.
 
         Raises:
             InputError: a part, name or constant is unknown or missing, or a constant is out of bounds.
@@ -228,7 +240,8 @@ class Law(nn.Module):
         _imported("io.laws").save_law(path, self, _imported("io.exported").about_law(self, **known))
 
     def kirchhoff(self, F: Tensor) -> Tensor:
-        """Kirchhoff stress tau [Pa] of trial deformation gradients after the return map, both (N, 3, 3).
+        """Kirchhoff stress tau [Pa] of trial deformation gradients after the return map, both (N, 3, 3). The viscous
+        part, which depends on the past, adds nothing.
 
         Differentiable in F and the weights, in the precision of F, as a module of other solvers.
         """
@@ -241,13 +254,18 @@ class Law(nn.Module):
 
     def tangent(self, F: Tensor) -> Tensor:
         """Consistent tangent dP_ij / dF_kl [Pa], (N, 3, 3, 3, 3), of `first_piola`. Detached."""
-        with torch.enable_grad():
-            F = F.detach().requires_grad_()
-            components = self.first_piola(F).sum(dim=0).flatten()
-            if not components.requires_grad:
-                return F.new_zeros(len(F), 3, 3, 3, 3)
-            rows = [torch.autograd.grad(component, F, retain_graph=True)[0] for component in components]
-        return torch.stack(rows, dim=1).unflatten(1, (3, 3))
+        F = F.detach()
+        elastic, plastic = (tuple(w.detach().to(F) for w in own) for own in self.weights())
+        E, plastic_cache = self.plasticity.evaluate_with_cache(F, plastic)
+        tau, cache = self.elasticity.evaluate_with_cache(E, elastic)
+        slopes = []
+        for unit in torch.eye(9, dtype=F.dtype, device=F.device).reshape(9, 1, 3, 3):
+            grad = self.elasticity.vjp(E, elastic, unit.expand_as(F).contiguous(), cache)[0]
+            slopes.append(self.plasticity.vjp(F, plastic, grad, plastic_cache)[0])
+        by_F = torch.stack(slopes, dim=1).unflatten(1, (3, 3))  # d tau_ij / dF_kl
+        inverse = torch.linalg.inv(F)
+        P = tau @ inverse.mT
+        return torch.einsum("nimkl,njm->nijkl", by_F, inverse) - torch.einsum("nil,njk->nijkl", P, inverse)
 
     def weights(self) -> tuple[Weights, Weights]:
         """Weights of the elasticity and of the plasticity."""
@@ -282,8 +300,15 @@ class Law(nn.Module):
         return float(torch.linalg.eigvalsh(0.5 * (Q + Q.mT)).max())
 
     def wave_speed(self, rho: float) -> float:
-        """Largest speed of small elastic waves at F = I [m/s], for density rho [kg/m^3]."""
-        return max(self.longitudinal_modulus(), 0.0) ** 0.5 / rho**0.5
+        """Largest speed of small elastic waves at F = I [m/s], for density rho [kg/m^3].
+
+        With a viscous part, that of an elastic law with the same limit of the time step
+        (`catalogue.viscous_stiffness`).
+        """
+        modulus = max(self.longitudinal_modulus(), 0.0)
+        if self.viscosity is not None:
+            modulus += viscous_stiffness({key: float(v) for key, v in self.viscosity.values.items()})
+        return modulus**0.5 / rho**0.5
 
 
 def _imported(module: str) -> ModuleType:

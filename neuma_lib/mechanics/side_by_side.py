@@ -78,10 +78,16 @@ class SideBySide(Constitutive):
         return kernels.vjp(self.part, F, weights[0], grad_out, cache, grad_F, grad_weights[0]), grad_weights
 
 
-def fusible(law: Law) -> bool:
-    """Whether both parts of a law have kernels and fixed constants."""
+def has_kernels(law: Law) -> bool:
+    """Whether all parts of a law have kernels and fixed constants."""
     parts = law.elasticity, law.plasticity
-    return all(isinstance(part, Constants) and part.native and not part.weights() for part in parts)
+    fixed = law.viscosity is None or not law.viscosity.weights()
+    return fixed and all(isinstance(part, Constants) and part.native and not part.weights() for part in parts)
+
+
+def fusible(law: Law) -> bool:
+    """Whether a law can be one of those of `side_by_side`: with kernels, and without a viscous part."""
+    return law.viscosity is None and has_kernels(law)
 
 
 def side_by_side(laws: Sequence[Law], device: torch.device | str = "cpu") -> Law:

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
+from neuma_lib.evaluation.calibration import describe_families, interval, kind_of
 from neuma_lib.evaluation.plotting import style
 from neuma_lib.paper.identified_table import true_values
 
-_BARS = 2  # standard deviations that error bars show
 _RATIOS = (0.01, 0.1, 0.3, 0.5, 0.7, 1, 1.5, 2, 3, 10, 100)  # ticks
 _WIDEST = 1.5  # maximum length of an error bar to either side, in decades
 
@@ -23,7 +22,7 @@ def identified_page(identified: Mapping[str, Any], truth: Mapping[str, Mapping[s
 
     They are those of the material, or of the grid if there is no second one.
 
-    Error bars are two standard deviations, crosses are the truth.
+    Error bars are calibrated 95 % intervals, crosses are the truth. The title has the probabilities of families.
 
     Args:
         identified: content of identified.json.
@@ -48,8 +47,9 @@ def identified_page(identified: Mapping[str, Any], truth: Mapping[str, Mapping[s
     quantities = identified.get("material", identified["best"])["quantities"]
     true = true_values(truth or {})
     for place, (name, entry) in enumerate(reversed(quantities.items())):
-        std = min(_BARS * entry["log_std"], _WIDEST * math.log(10))
-        reach = [[1 - math.exp(-std)], [math.exp(std) - 1]]
+        _, high = interval(1.0, entry["log_std"], quantity=kind_of(identified))
+        factor = min(high, 10**_WIDEST)
+        reach = [[1 - 1 / factor], [factor - 1]]
         colour = style.BLACK if entry["determined"] else style.GREY
         constants.errorbar([1], [place], xerr=reach, fmt="o", color=colour, capsize=2)
         if name in true and true[name] > 0 and entry["value"] > 0:
@@ -64,8 +64,7 @@ def identified_page(identified: Mapping[str, Any], truth: Mapping[str, Mapping[s
     constants.set_xticks(ticks, [f"{tick:g}" for tick in ticks], minor=False)
     constants.xaxis.set_minor_formatter(NullFormatter())
     constants.axvline(1, color=style.LIGHT, zorder=0)
-    tied = f", tie with {', '.join(identified['ties'])}" if identified["ties"] else ""
     lowest = identified.get("contact_friction", {}).get("at_least")
     friction = "" if lowest is None else f", contact_friction at least {lowest:.2g}"
-    constants.set_title(identified["family"] + tied + friction)
+    constants.set_title((describe_families(identified) or identified["family"]) + friction)
     return figure

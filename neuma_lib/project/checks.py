@@ -19,7 +19,14 @@ import numpy as np
 from neuma_lib.config.obstacles import ColliderConfig, is_mesh_file
 from neuma_lib.config.validation import hint
 from neuma_lib.errors import InputError
-from neuma_lib.mechanics.catalogue import COURANT_LIMIT, DEFINED_IN, check_law, longitudinal_modulus
+from neuma_lib.mechanics.catalogue import (
+    COURANT_LIMIT,
+    DEFINED_IN,
+    PARTS,
+    check_law,
+    longitudinal_modulus,
+    viscous_stiffness,
+)
 from neuma_lib.project.capture_scenes import checked_capture
 from neuma_lib.project.consistency import prior_errors
 from neuma_lib.project.random_scenes import LETTER, SHAPES, Proportions, flight
@@ -89,11 +96,11 @@ def _laws(settings: Config) -> Iterator[tuple[str, dict[str, Any]]]:
                 yield f"random.{group}.{name}", {key: part.at(end) for key, part in parts.items()}
 
 
-def _checked(where: str, spec: Mapping[str, Any]) -> tuple[dict[str, Any] | None, list[str]]:
-    """A complete law, or None and its problem."""
-    plain = {key: value for key, value in spec.items() if key in ("elasticity", "plasticity")}
+def _checked(where: str, spec: Mapping[str, Any], dt: float = 1.0) -> tuple[dict[str, Any] | None, list[str]]:
+    """A complete law, with the time step [s] in parts that depend on it, or None and its problem."""
+    plain = {key: value for key, value in spec.items() if key in PARTS}
     try:
-        return check_law(plain, dt=1.0), []
+        return check_law(plain, dt), []
     except InputError as error:
         return None, [str(InputError(f"{where}.{error.where}", error.problem, error.remedy))]
 
@@ -260,11 +267,14 @@ def _courant_problem(
 ) -> Iterator[str]:
     """The problem of a time step that is unstable for a law; none for a law that `law_problems` reports, or whose
     modulus is unknown here because it is not built in."""
-    law, _ = _checked(where, spec)
+    law, _ = _checked(where, spec, dt)
     if law is None or ("elasticity", law["elasticity"]["name"]) in DEFINED_IN:
         return
     rho = min(density["below"], density["above"]) if isinstance(density, Mapping) else density
-    number = math.sqrt(longitudinal_modulus(law["elasticity"]) / rho) * dt * grid
+    modulus = longitudinal_modulus(law["elasticity"])
+    if "viscosity" in law:
+        modulus += viscous_stiffness(law["viscosity"])
+    number = math.sqrt(modulus / rho) * dt * grid
     if number > COURANT_LIMIT:
         yield (
             f"{where}: the Courant number {number:.3g} exceeds {COURANT_LIMIT} with dt = {dt:g} s and {grid} grid "

@@ -22,6 +22,7 @@ from neuma_lib.config.figures import FiguresConfig
 from neuma_lib.config.gaussians import GaussiansConfig
 from neuma_lib.config.geometry import GeometryConfig
 from neuma_lib.config.identify import IdentifyConfig
+from neuma_lib.config.next import NextConfig
 from neuma_lib.config.obstacles import ColliderConfig
 from neuma_lib.config.photographs import PhotographsConfig
 from neuma_lib.config.priors import PriorsConfig
@@ -71,6 +72,7 @@ class Config(Section):
     binding: BindingConfig = Field(BindingConfig(), description="Gaussians to particles")
     velocity: VelocityConfig = Field(VelocityConfig(), description="initial velocity")
     identify: IdentifyConfig = Field(IdentifyConfig(), description="family and constants of the material")
+    next: NextConfig = Field(NextConfig(), description="choice of the next experiment")
     training: TrainingConfig = Field(TrainingConfig(), description="adaptation of the law")
     structured: StructuredConfig = Field(
         StructuredConfig(), description="laws with the structure of a material"

@@ -10,7 +10,7 @@ import torch
 
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.mechanics.law import Law
-from neuma_lib.mechanics.side_by_side import fusible, side_by_side
+from neuma_lib.mechanics.side_by_side import fusible, has_kernels, side_by_side
 from neuma_lib.sim.model import MPM, MaterialRegion
 from neuma_lib.sim.rollout import check_inside, checked_frames, fly_and_simulate
 from neuma_lib.sim.state import State, Trajectory
@@ -36,8 +36,8 @@ def rollout_batch(
     """`rollout` for each of several laws, equal to round-off, without gradients.
 
     On a GPU, copies share launches. Analytic laws with kernels (`analytic_kernels`) are evaluated in one launch for any
-    kinds and constants. Other laws share only the transfers. On a CPU, copies of laws with kernels run in threads
-    (`threads.in_threads`), with the same results for any number of threads.
+    kinds and constants. Other laws share only the transfers, those with a viscous part nothing. On a CPU, copies of
+    laws with kernels run in threads (`threads.in_threads`), with the same results for any number of threads.
 
     Args:
         model: as in `rollout`, one for all laws or one per law. They may differ in friction.
@@ -75,17 +75,19 @@ def rollout_batch(
     order = sorted(range(len(laws)), key=lambda copy: not fusible(laws[copy]))
     device, dtype = starts[0].x.device, starts[0].x.dtype
     together = together or TOGETHER[device.type]
-    groups = [order[i : i + together] for i in range(0, len(laws), together)]
+    viscous = [copy for copy in order if laws[copy].viscosity is not None]
+    order = [copy for copy in order if laws[copy].viscosity is None]
+    groups = [order[i : i + together] for i in range(0, len(order), together)] + [[copy] for copy in viscous]
 
     def simulated(copies: Sequence[int]) -> list[Trajectory | None]:
         own = [laws[copy] for copy in copies], [starts[copy] for copy in copies]
         frictions = [models[copy].frictions for copy in copies]
         return _side_by_side(model, *own, frames, total, skip_free_flight, frictions)
 
-    threads = 1 if device.type == "cuda" or not all(map(fusible, laws)) else None
+    threads = 1 if device.type == "cuda" or not all(map(has_kernels, laws)) else None
     paths = in_threads(simulated, groups, (rollout_batch, model.frictionless, dtype, total), threads)
     result: list[Trajectory | None] = [None] * len(laws)
-    for copy, path in zip(order, chain.from_iterable(paths), strict=True):
+    for copy, path in zip(order + viscous, chain.from_iterable(paths), strict=True):
         result[copy] = path
     return result
 

@@ -17,6 +17,7 @@ from torch.autograd.function import once_differentiable
 
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.mechanics.law import Law
+from neuma_lib.sim.branches import branched, merged
 from neuma_lib.sim.free_flight import ballistic, free_flight_steps
 from neuma_lib.sim.memory import DEFAULT_CACHE_BYTES, plan_memory
 from neuma_lib.sim.model import MPM, MaterialRegion, as_regions
@@ -162,6 +163,17 @@ def fly_and_simulate(
     Returns one error per copy, or None. The states of a copy with an error are undefined. If all copies have one, the
     first is raised.
     """
+    count, both = len(state.x), branched(regions, state)
+    if both:
+        if copies > 1:
+            raise InputError(
+                "laws", "those with a viscous part share no launches", "Simulate them one by one"
+            )
+        regions, state, owners = both
+
+    def of_laws(path: Trajectory) -> Trajectory:
+        return merged(path, owners, count) if both else path
+
     for region in regions:
         for part in (region.law.elasticity, region.law.plasticity):
             for own in getattr(part, "parts", (part,)):
@@ -175,7 +187,7 @@ def fly_and_simulate(
     flight = ballistic(model, start, tuple(more), tracers, frames[:in_flight]) if in_flight else None
     frames = frames[in_flight:]
     if flight is not None and not frames:
-        return flight, [None] * copies
+        return of_laws(flight), [None] * copies
     if first:
         landed = ballistic(model, start, tuple(more), tracers, (first,))
         start = (landed.x[0], landed.v[0], *start[2:])
@@ -194,7 +206,7 @@ def fly_and_simulate(
     )
     *states, seen = RolloutFunction.apply(simulation, [n - first for n in frames], tracers, *inputs)
     path = Trajectory(frames, *states[:4], tracers=seen, **dict(zip(more, states[4:], strict=True)))
-    return path if flight is None else flight.followed_by(path), simulation.errors
+    return of_laws(path if flight is None else flight.followed_by(path)), simulation.errors
 
 
 class RolloutFunction(torch.autograd.Function):

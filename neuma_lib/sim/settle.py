@@ -10,7 +10,7 @@ import torch
 from neuma_lib.errors import InputError
 from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.clamps import clamped_particles
-from neuma_lib.sim.model import MPM, MaterialRegion
+from neuma_lib.sim.model import MPM, MaterialRegion, as_regions
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 
@@ -33,6 +33,8 @@ def settle(
     where the dominant vibration passes its equilibrium (kinetic damping, Cundall 1976). A stage ends at the first
     maximum, the last one when all speeds have stayed below the tolerance for a time without damping.
 
+    The viscous part of a law is relaxed at rest. It has no effect here.
+
     Args:
         model, law, state: as in `simulate`. Velocities of the state are not used.
         tolerance: largest speed [m/s].
@@ -50,14 +52,18 @@ def settle(
     """
     clamps = tuple(replace(clamp.at_rest(), release=float("inf")) for clamp in model.clamps)
     still = replace(model, colliders=tuple(each.at_rest() for each in model.colliders), clamps=clamps)
+    regions = [
+        replace(each, law=Law(each.law.elasticity, each.law.plasticity, each.law.name))
+        for each in as_regions(law, len(state.x))
+    ]
     clamp = clamped_particles(clamps, state.x) if clamps and state.clamp is None else state.clamp
     rest = {"v": torch.zeros_like(state.x), "C": torch.zeros_like(state.F)}
-    state, taken = replace(state, clamp=clamp, **rest), 0
+    state, taken = replace(state, clamp=clamp, F_branch=None, **rest), 0
     for stage in range(1, stages + 1):
         gravity = tuple(stage / stages * g for g in model.gravity)
         ramped, energy, calm = replace(still, gravity=gravity), 0.0, 0
         while calm < quiet:
-            path = rollout(ramped, law, state, steps=every, frames=(every,), skip_free_flight=False)
+            path = rollout(ramped, regions, state, steps=every, frames=(every,), skip_free_flight=False)
             state = state.after(path)
             taken, before = taken + every, energy
             energy = float(state.mass @ state.v.square().sum(dim=1))

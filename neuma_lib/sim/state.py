@@ -25,6 +25,7 @@ class State:
         C: APIC affine velocities [1/s], shape (N, 3, 3), by default zero.
         clamp: index of the clamp that holds each particle, or -1, shape (N,), by default from the positions.
         stuck: tangential displacements since particles stick to a `Collider` [m], shape (N, 3), by default zero.
+        F_branch: deformation gradients of the viscous branch of a law, shape (N, 3, 3). None: relaxed.
 
     Raises:
         InputError: shapes, precisions or devices do not match, or a value is not finite or a mass or volume not
@@ -39,6 +40,7 @@ class State:
     C: Tensor = None  # type: ignore[assignment]
     clamp: Tensor | None = None
     stuck: Tensor = None  # type: ignore[assignment]
+    F_branch: Tensor | None = None
 
     def __post_init__(self):
         x = self.x
@@ -55,7 +57,10 @@ class State:
         if self.stuck is None:
             object.__setattr__(self, "stuck", torch.zeros_like(x))
         shapes = {"x": [(N, 3)], "v": [(N, 3), (3,)], "mass": [(N,)], "vol0": [(N,)]}
-        for name, allowed in (shapes | {"F": [(N, 3, 3)], "C": [(N, 3, 3)], "stuck": [(N, 3)]}).items():
+        shapes |= {"F": [(N, 3, 3)], "C": [(N, 3, 3)], "stuck": [(N, 3)]}
+        if self.F_branch is not None:
+            shapes["F_branch"] = [(N, 3, 3)]
+        for name, allowed in shapes.items():
             value = getattr(self, name)
             if tuple(value.shape) not in allowed:
                 expected = " or ".join(map(str, allowed))
@@ -112,11 +117,18 @@ class State:
         clamps = [body.clamp for body in bodies if body.clamp is not None]
         if clamps and len(clamps) < len(bodies):
             raise InputError("state.clamp", "must be given for all joined bodies or for none")
-        return cls(x, v, mass, vol0, F, C, torch.cat(clamps) if clamps else None, stuck)
+        branches = None
+        if any(body.F_branch is not None for body in bodies):
+            relaxed = torch.eye(3, dtype=x.dtype, device=x.device)
+            branches = torch.cat(
+                [relaxed.expand_as(body.F) if body.F_branch is None else body.F_branch for body in bodies]
+            )
+        return cls(x, v, mass, vol0, F, C, torch.cat(clamps) if clamps else None, stuck, branches)
 
     def after(self, path: Trajectory, frame: int = -1) -> State:
         """The state at the frame of this index of a trajectory, from which a simulation continues exactly."""
-        names = ("x", "v", "F", "C", *(["stuck"] if path.stuck is not None else []))
+        more = [name for name in ("stuck", "F_branch") if getattr(path, name) is not None]
+        names = ("x", "v", "F", "C", *more)
         return replace(self, **{name: getattr(path, name)[frame] for name in names})
 
     def to(self, device: torch.device | str) -> State:
@@ -124,7 +136,9 @@ class State:
         moved = {
             name: getattr(self, name).to(device) for name in ("x", "v", "mass", "vol0", "F", "C", "stuck")
         }
-        return State(**moved, clamp=None if self.clamp is None else self.clamp.to(device))
+        optional = {"clamp": self.clamp, "F_branch": self.F_branch}
+        given = {name: value.to(device) for name, value in optional.items() if value is not None}
+        return State(**moved, **given)
 
     @property
     def density(self) -> Tensor:
@@ -155,6 +169,7 @@ class Trajectory:
         tracers: positions of passive tracers [m], shape (T, M, 3), or None.
         F_total: total deformation gradients, elastic and plastic, shape (T, N, 3, 3), or None.
         stuck: tangential displacements of particles that stick [m], shape (T, N, 3), None unless particles touch.
+        F_branch: deformation gradients of the viscous branch, shape (T, N, 3, 3), None unless a law has one.
     """
 
     frames: tuple[int, ...]
@@ -165,6 +180,7 @@ class Trajectory:
     tracers: Tensor | None = None
     F_total: Tensor | None = None
     stuck: Tensor | None = None
+    F_branch: Tensor | None = None
 
     def at(self, frames: Sequence[int]) -> Trajectory:
         """The states at some of the frames. Frames after the last one repeat it.
@@ -178,6 +194,11 @@ class Trajectory:
             raise InputError("frames", f"{list(frames)} must be frames of the trajectory")
         path = replace(self._each(lambda value: value[[index[n] for n in reached]]), frames=reached)
         return path.hold_last(len(frames) - len(reached)) if len(reached) < len(frames) else path
+
+    def of(self, particles: slice) -> Trajectory:
+        """The states of some of the particles, with all tracers."""
+        own = self._each(lambda value: value[:, particles])
+        return replace(own, tracers=self.tracers)
 
     def first(self, count: int) -> Trajectory:
         """The states at the first ``count`` frames."""

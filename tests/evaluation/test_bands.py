@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from neuma_lib.evaluation.bands import (
-    COVERED,
     LENGTH,
     SILENT,
     _log_moduli,
@@ -23,6 +22,7 @@ from neuma_lib.fitting.families import Family
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.structured import LIMIT, WIDTH, initial_weights, network, structured_law
 
+COVERED = 0.95
 DT = 5e-4
 MISES = {
     "elasticity": {"name": "hencky", "E": 1e5, "nu": 0.3},
@@ -98,7 +98,7 @@ def test_constants_cover_truths_around_their_estimates():
     for seed in range(trials):
         u = generator.multivariate_normal(truth, covariance)
         laws = constants_draws(fit(family.law_spec(family.bounded(u)), covariance), 0.0, DT, 100, seed)
-        low, high = band(laws, lambda law: sheared(law, shear))
+        low, high = band(laws, lambda law: sheared(law, shear), COVERED)
         covered += (low <= true) & (true <= high)
     low, high = binomial_bounds(trials)
     assert (low <= covered).all() and (covered <= min(high, trials)).all(), covered / trials

@@ -25,6 +25,7 @@ from neuma_lib.fitting.least_squares import (
     block_sums,
     in_blocks,
     jackknife,
+    laplace,
     levenberg_marquardt,
     secant_update,
 )
@@ -388,6 +389,21 @@ def test_fits_restart_from_better_ones_that_started_later():
     assert _better_later([stuck, elastic, worse, flow]) == []
 
 
+def test_a_fit_restarts_from_the_best_constants_if_they_are_better():
+    """A flow that starts beyond its yield stress never yields: a local minimum that other limits leave."""
+    body, seen = video_of(PLASTIC, V0, FRAMES)
+    chosen = settings({"plastic": PLASTIC}, covariance_from="elastic", refined_particles=0, iterations=3)
+    video, family = VideoResiduals(MODEL, known(body), body, seen, chosen), Family("plastic", PLASTIC)
+    stuck = family.with_guesses({"yield_stress": 1e6})
+    run = FamilyRun(family, [video], [len(FRAMES)], chosen)
+    run.begin([stuck])
+    before = run.fit.cost
+    run.restart_from([stuck, *family.with_other_limits(stuck, (1, 2))])
+    assert run.fit.cost == before, "no start is better"
+    run.restart_from([stuck, *family.with_other_limits(stuck, (-4, -2))])
+    assert run.fit.cost < 0.5 * before and run.values["yield_stress"] < 1e5
+
+
 def test_a_flow_that_never_yields_shows_the_elastic_body():
     """And one that yields does not, whatever their squared residuals."""
     body, seen = video_of(ELASTIC, V0, FRAMES)
@@ -663,6 +679,33 @@ def test_errors_that_all_images_share_are_part_of_every_uncertainty():
     assert [each["log_std"] for each in fit.combinations(options)] == pytest.approx([0.07, 0.07])
     stds = [each["log_std"] for each in fit.as_dict(options)["quantities"].values()]
     assert stds == pytest.approx([0.07] * len(stds))
+
+
+def test_the_laplace_approximation_is_the_covariance_for_independent_noise():
+    """Of a linear problem with the prior, against the normal equations written out, and against many noisy problems."""
+    generator, sigma, spreads = np.random.default_rng(0), 0.3, np.array([2.0, 0.5, 1.0])
+    J = generator.standard_normal((400, 3))
+    truth = spreads * generator.standard_normal((500, 3))
+    residuals = truth @ J.T + sigma * generator.standard_normal((500, 400))
+    precision = J.T @ J / sigma**2 + np.diag(spreads**-2.0)
+    fit = Linearisation((J.T @ J)[None], np.zeros((1, 3)), 400 * sigma**2, sigma)
+    covariance = laplace(fit, spreads)
+    np.testing.assert_allclose(covariance, np.linalg.inv(precision), rtol=1e-10)
+    errors = residuals @ J @ covariance / sigma**2 - truth
+    np.testing.assert_allclose(errors.std(axis=0), np.sqrt(np.diag(covariance)), rtol=5 * 500**-0.5)
+
+
+def test_an_identification_records_the_laplace_approximation_and_comparable_scores():
+    """With residuals of one pixel noise it is smaller than the jackknife, which includes more."""
+    families = {"hencky": ELASTIC, "neo_hookean": law("neo_hookean")}
+    content = identified_in(law("hencky", E=1.5e4, nu=0.35), families, pyramid=(8, 32)).as_dict()
+    assert set(content["compared"]) == {n for n, fit in content["families"].items() if "score" in fit}
+    assert content["family"] in content["compared"]
+    own = content["best"]
+    whole, plain = (np.array(own["unbounded"][key]) for key in ("covariance", "laplace"))
+    assert plain.shape == whole.shape and (np.diag(plain) > 0).all()
+    assert 0 < own["quantities"]["E"]["laplace_log_std"] < own["quantities"]["E"]["log_std"]
+    assert own["quantities"]["E"]["laplace_log_std"] == pytest.approx(plain[0, 0] ** 0.5, rel=1e-3)
 
 
 def test_a_summary_lists_what_is_determined_and_what_is_not():

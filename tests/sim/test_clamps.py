@@ -16,7 +16,7 @@ from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.settle import settle
 from neuma_lib.sim.state import State
 from tests.support.errors import refused
-from tests.support.sim_scenes import DENSITY, DT, cube, make_law, moving_cube, strained
+from tests.support.sim_scenes import DENSITY, DT, cube, make_law, moving_cube, prism, strained
 
 pytestmark = pytest.mark.core
 
@@ -174,18 +174,6 @@ def test_cuda_equals_cpu(name, scatter):
         torch.testing.assert_close(other[0], results[0][0], rtol=0, atol=1e-11)
         for a, b in zip(other[1:], results[0][1:], strict=True):
             assert (a - b).abs().max() < 1e-8 * b.abs().max()
-
-
-def prism(size, spacing, corner):
-    """A block on a regular lattice, with its lowest corner, as a `State` at rest."""
-    counts = [round(s / spacing) for s in size]
-    ticks = [
-        c + s * (torch.arange(n, dtype=torch.float64) + 0.5) / n
-        for c, s, n in zip(corner, size, counts, strict=True)
-    ]
-    x = torch.cartesian_prod(*ticks)
-    vol0 = torch.full((len(x),), math.prod(size) / len(x), dtype=torch.float64)
-    return State(x, torch.zeros(3).double(), DENSITY * vol0, vol0)
 
 
 GRAVITY = 9.8

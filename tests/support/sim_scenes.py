@@ -1,5 +1,7 @@
 """Laws, particles and motions that the simulator's tests share."""
 
+import math
+
 import torch
 from torch.nn.functional import gelu
 
@@ -70,6 +72,18 @@ def cube(count=300, side=0.3, centre=(0.5, 0.5, 0.5), seed=0, dtype=torch.float6
     x = torch.tensor(centre, dtype=torch.float64) + side * spread
     vol0 = torch.full((count,), side**3 / count, dtype=torch.float64)
     return x.to(dtype), (DENSITY * vol0).to(dtype), vol0.to(dtype)
+
+
+def prism(size, spacing, corner):
+    """A block on a regular lattice, with its lowest corner, as a `State` at rest."""
+    counts = [round(s / spacing) for s in size]
+    ticks = [
+        c + s * (torch.arange(n, dtype=torch.float64) + 0.5) / n
+        for c, s, n in zip(corner, size, counts, strict=True)
+    ]
+    x = torch.cartesian_prod(*ticks)
+    vol0 = torch.full((len(x),), math.prod(size) / len(x), dtype=torch.float64)
+    return State(x, torch.zeros(3).double(), DENSITY * vol0, vol0)
 
 
 def moving_cube(velocity, **options):

@@ -17,6 +17,7 @@ from PIL import Image
 
 from neuma_lib.capture.pictures import read_picture
 from neuma_lib.capture.report.page import Check
+from neuma_lib.evaluation.calibration import describe_families, interval, kind_of
 
 _PICTURE_WIDTH, _QUALITY = 1000, 80  # maximum width [px] and JPEG quality of pictures in the page
 STRESS_UNITS = {
@@ -27,7 +28,7 @@ STRESS_UNITS = {
 }
 """Units of constants that are proportional to stress."""
 OTHER_UNITS = {"friction_angle": "°", "dilation_angle": "°", "relaxation_time": "s"}
-_UNKNOWN = 100.0  # factor of two standard deviations above which a constant is unknown
+_UNKNOWN = 100.0  # ratio of the upper end of an interval to the value, above which a constant is unknown
 MEASURES = {
     "psnr": ("PSNR, object [dB]", 1),
     "ssim": ("SSIM, object", 3),
@@ -196,12 +197,10 @@ def _law(identified: Mapping[str, Any], scale: float) -> dict[str, Any]:
         value, unit = room_value(name, entry["value"], scale)
         prefix, unit = prefixed(value, unit)
         value *= prefix
-        factor = math.exp(min(2 * entry["log_std"], 700.0))  # without overflow
-        interval = "unknown" if factor > _UNKNOWN else f"{number(value / factor)} to {number(value * factor)}"
+        low, high = interval(value, entry["log_std"], quantity=kind_of(identified))
+        ends = "unknown" if high > _UNKNOWN * value else f"{number(low)} to {number(high)}"
         text = f"{number(value)} {unit}".strip()
-        constants.append(
-            {"name": name, "value": text, "interval": interval, "determined": entry["determined"]}
-        )
+        constants.append({"name": name, "value": text, "interval": ends, "determined": entry["determined"]})
     if (lowest := identified.get("contact_friction", {}).get("at_least")) is not None:
         bound = {"value": f"at least {number(lowest)}", "interval": "the body may stick", "determined": False}
         constants.append({"name": "contact_friction", **bound})
@@ -211,6 +210,7 @@ def _law(identified: Mapping[str, Any], scale: float) -> dict[str, Any]:
     return {
         "family": identified["family"],
         "ties": identified.get("ties"),
+        "probabilities": describe_families(identified),
         "constants": constants,
         "families": [(name, f"{known[name]['held_out_loss']:.2e}") for name in order],
         "dropped": [name for name in families if name not in known],

@@ -27,6 +27,8 @@ class PacFamilyConfig(LawConfig):
         known = {**self.elasticity.model_extra, **self.plasticity.model_extra, **dict.fromkeys(MODULI)}
         if wrong := [name for name in self.fitted if name not in FITTED or name not in known]:
             raise ValueError(f"fitted: {', '.join(wrong)} is not a constant of the law that can be fitted")
+        if self.viscosity is not None:
+            raise ValueError("viscosity: PAC-NeRF has no viscous part of solids. Leave it out")
         if {"E", "nu"} & set(self.fitted) and set(MODULI) & set(self.fitted):
             raise ValueError("fitted: give E and nu, or mu and kappa, not both pairs")
         return self
