@@ -40,12 +40,12 @@ class LengthConfig(Section):
     )
     ends: dict[str, tuple[Pixel, Pixel]] = Field(
         {},
-        description="photograph -> (x, y) of both points [px], from the upper left corner as it is displayed; in two "
-        "photographs or more, or in one if both points are on the floor",
+        description="photograph -> (x, y) of both points [px], from the upper left corner of the displayed picture; in "
+        "two photographs or more, or in one if both points are on the floor",
     )
 
     @model_validator(mode="after")
-    def _between_two_things(self) -> LengthConfig:
+    def _between_two_objects(self) -> LengthConfig:
         if bool(self.ends) == (self.cameras is not None):
             raise ValueError("ends: mark the two points in photographs, or name two photographs as `cameras`")
         return self
@@ -114,7 +114,7 @@ class CaptureConfig(Section):
     object: dict[str, Rectangle] = Field(
         {},
         description="photograph -> (x0, y0, x1, y1) of a tight box around the whole object [px], from the upper left "
-        "corner as it is displayed; needed if other things stand around the object; one is enough",
+        "corner of the displayed picture; needed if other objects are around; one is enough",
     )
     center: Pixel | None = Field(
         None,

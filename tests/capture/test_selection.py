@@ -1,4 +1,4 @@
-"""Masks of an object that is selected by a box among other things, and boxes that select nothing."""
+"""Masks of an object that is selected by a box among other objects, and boxes that select nothing."""
 
 import numpy as np
 import pytest
@@ -47,8 +47,8 @@ def largest(room):
 def test_one_box_selects_the_object_in_all_photographs(room):
     first = largest(room)
     masks = select(room, {first: box_around(room.masks[first])})
-    found = [iou(a, b) for a, b in zip(masks, room.masks)]
-    assert np.mean(found) > GOAL and min(found) > 0.85
+    ious = [iou(a, b) for a, b in zip(masks, room.masks)]
+    assert np.mean(ious) > GOAL and min(ious) > 0.85
 
 
 def test_without_points_two_boxes_locate_the_object(room):
@@ -58,8 +58,8 @@ def test_without_points_two_boxes_locate_the_object(room):
         select(room, {first: box_around(room.masks[first])}, **unknown)
     second = (first + 4) % len(room.masks)
     boxes = {k: box_around(room.masks[k]) for k in (first, second)}
-    found = [iou(a, b) for a, b in zip(select(room, boxes, **unknown), room.masks)]
-    assert np.mean(found) > 0.9
+    ious = [iou(a, b) for a, b in zip(select(room, boxes, **unknown), room.masks)]
+    assert np.mean(ious) > 0.9
 
 
 def test_a_box_that_is_much_larger_than_the_object_is_refused(room):
@@ -98,16 +98,16 @@ def test_a_box_of_a_displayed_photograph_is_that_of_the_sensor(orientation, rect
 
 @pytest.mark.slow
 def test_cluttered_rooms(tmp_path_factory):
-    """IoU in six rooms with 12 other things each, some in front of the object, one in its colour, one beside it."""
+    """IoU in six rooms with 12 other objects each, of which some hide the selected one, and one has its colour."""
     network = Saliency(fetch_network(tmp_path_factory.getbasetemp()))
     means = []
     for seed in SEEDS:
         room = cluttered_room(seed)
         first = largest(room)
         masks = select(room, {first: box_around(room.masks[first])}, network)
-        found = np.array([iou(a, b) for a, b in zip(masks, room.masks)])
-        means.append(found.mean())
+        ious = np.array([iou(a, b) for a, b in zip(masks, room.masks)])
+        means.append(ious.mean())
         print(
-            f"room {seed}: mean IoU {found.mean():.3f}, median {np.median(found):.3f}, lowest {found.min():.3f}"
+            f"room {seed}: mean IoU {ious.mean():.3f}, median {np.median(ious):.3f}, lowest {ious.min():.3f}"
         )
     assert np.mean(means) > 0.9

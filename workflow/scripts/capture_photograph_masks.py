@@ -79,11 +79,11 @@ def main(inputs, output, params, run) -> None:
             masks[k] = photograph_mask(pictures[k], network, frame["file_path"], outline)
             run.progress(k + 1, _STEPS * len(frames))
     hidden = [name for name, mask in zip(names, masks) if not mask.any()]
-    shown = [k for k, mask in enumerate(masks) if mask.any()]
+    selected = [k for k, mask in enumerate(masks) if mask.any()]
     frames, names, pictures, masks, is_own = (
-        [values[k] for k in shown] for values in (frames, names, pictures, masks, is_own)
+        [values[k] for k in selected] for values in (frames, names, pictures, masks, is_own)
     )
-    cameras, Ks = cameras[shown], Ks[shown]
+    cameras, Ks = cameras[selected], Ks[selected]
     ious = np.ones(1)
 
     def draw(path: Path) -> None:

@@ -426,8 +426,8 @@ def _poses_of(model: Any, pictures: Mapping[str, Path], lenses: Mapping[str, Len
     points = [model.points3D[number] for number in numbers]
     sightings = []
     for name in names:
-        shown = {point.point3D_id for point in images[name].points2D if point.has_point3D()}
-        sightings.append(np.flatnonzero(np.isin(numbers, list(shown))))
+        visible = {point.point3D_id for point in images[name].points2D if point.has_point3D()}
+        sightings.append(np.flatnonzero(np.isin(numbers, list(visible))))
     return Poses(
         names,
         tuple(own_lenses),

@@ -106,7 +106,7 @@ def box_in(rectangle: Sequence[float], orientation: int | None, lens: Lens, K: n
     """Box in an undistorted photograph.
 
     Args:
-        rectangle: left, upper, right, lower in the photograph as it is displayed [px].
+        rectangle: left, upper, right, lower in the displayed photograph [px].
         orientation: of `neuma_lib.capture.pictures.orientation_of`.
         lens: of the photograph.
         K: intrinsics of the undistorted one, (3, 3).
