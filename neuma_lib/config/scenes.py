@@ -85,6 +85,10 @@ class SceneConfig(Section):
     center: tuple[float, float] = Field(
         (0.5, 0.5), description="initial x and z of the centre of the bounding box [m]"
     )
+    rotation: Vector = Field(
+        (0.0, 0.0, 0.0),
+        description="rotation vector of the shape, before it is placed at height and center [rad]",
+    )
     velocity: Vector | None = Field(description="initial velocity [m/s]")
     spin: Vector = Field(
         (0.0, 0.0, 0.0), description="initial angular velocity about the centre of mass, world axes [rad/s]"
@@ -97,6 +101,10 @@ class SceneConfig(Section):
         (), description="obstacles, in addition to the faces of the cube"
     )
     clamps: tuple[ClampConfig, ...] = Field((), description="regions of the body that are held or moved")
+    # Random scenes draw it. They have contact of particles then.
+    friction: float | None = internal(
+        None, "Coulomb coefficient of the faces of the cube; null: simulation.boundary", ge=0
+    )
     law: LawConfig | None = Field(description="the true material, used by the ground truth only")
     truth: TruthConfig = Field(TruthConfig(), description="resolution of the ground truth")
     dt: float = Field(gt=0, description="time step of the reconstruction, the unit of frames and steps [s]")

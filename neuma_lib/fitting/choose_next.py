@@ -176,7 +176,6 @@ def choose_next(
     ties: bool = False,
     derivatives: Tensor | None = None,
     reframe: bool = True,
-    turn: bool = False,
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
     log: Callable[[str], None] = lambda text: None,
@@ -193,7 +192,6 @@ def choose_next(
         derivatives: of the motion to predict, see `motion_derivatives`, or None.
         reframe: whether the cameras are those of a rendered scene, which are placed so that they see the whole motion.
             They are fixed otherwise.
-        turn: whether the body may start in other orientations.
         seed: of the candidates.
         progress: called with (finished candidates, their number).
         log: receives a line for each candidate.
@@ -223,7 +221,7 @@ def choose_next(
 
     now = Forecast(fit, np.zeros_like(fit.covariance), {})
     before, prediction = ranked(now)
-    candidates = _candidates(filmed[0], known, lab, reframe, turn, seed)
+    candidates = _candidates(filmed[0], known, lab, reframe, seed)
     options, failed = [], 0
     for done, (kind, own, experiment, path) in enumerate(candidates):
         try:
@@ -246,7 +244,7 @@ def choose_next(
 
 
 def _candidates(
-    first: Experiment, known: Knowledge, lab: NextConfig, reframe: bool, turn: bool, seed: int
+    first: Experiment, known: Knowledge, lab: NextConfig, reframe: bool, seed: int
 ) -> list[tuple[str, dict[str, Any], Experiment | None, Trajectory | None]]:
     """Kind, settings, experiment and motion of each candidate; no experiment where the motion diverges."""
     frames = joint_frames(first.video)
@@ -258,9 +256,16 @@ def _candidates(
         for place, camera in second_cameras(cameras[0], points, reframe)[: lab.candidates]:
             video = [*first.video, unfilmed(frames, camera)]
             candidates.append(("camera", dict(place), path and replace(first, video=video), path))
-    if "launch" in lab.kinds and len(candidates) < lab.candidates:
-        count = lab.candidates - len(candidates)
-        launches = draw_launches(first.model, first.body, first.motion, frames[-1], lab, count, seed, turn)
+    turned = [kind == "turned" for kind in lab.kinds if kind != "camera"]
+    left = lab.candidates - len(candidates)
+    for k, turn in enumerate(turned):
+        count = (k + 1) * left // len(turned) - k * left // len(turned)
+        if count < 1:
+            continue
+        own_seed = seed + int(turn)
+        launches = draw_launches(
+            first.model, first.body, first.motion, frames[-1], lab, count, own_seed, turn
+        )
         spaced = [
             tuple(round(k * launch.steps / (len(frames) - 1)) for k in range(len(frames)))
             for launch in launches

@@ -29,7 +29,7 @@ from neuma_lib.mechanics.catalogue import (
 )
 from neuma_lib.project.capture_scenes import checked_capture
 from neuma_lib.project.consistency import prior_errors
-from neuma_lib.project.random_scenes import LETTER, SHAPES, Proportions, flight
+from neuma_lib.project.random_scenes import LETTER, SHAPES, Proportions, flight, rotation_matrix
 from neuma_lib.project.settings import Config
 
 ROUND_OFF = 1e-6
@@ -184,6 +184,8 @@ def _start_problems(
         return
     size = body["size"] or proportions.size
     half = size * np.array(proportions.sides) / 2
+    if any(body.get("rotation", ())):  # of the ellipsoid in the turned box, which the body about fills
+        half = np.sqrt((rotation_matrix(body["rotation"]) ** 2) @ half**2)
     middle = np.array([body["center"][0], body["height"], body["center"][1]])
     for axis, key, low, high in zip("xyz", ("center", "height", "center"), middle - half, middle + half):
         if low < -ROUND_OFF or high > 1 + ROUND_OFF:

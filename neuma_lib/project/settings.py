@@ -138,9 +138,11 @@ class Config(Section):
         for body in self.experiment(name).bodies:
             scene = self.scene(body.scene).plain()
             keys = ("shape", "size", "height", "center", "velocity", "spin", "density", "law", "appearance")
+            rotation = scene["rotation"] if body.shape is None else [0.0, 0.0, 0.0]
             own = {key: value for key, value in body.plain().items() if value is not None}
             own |= {"size": body.size} if body.shape is not None else {}
-            bodies.append({**{key: scene[key] for key in keys}, **own, "reconstructed": body.shape is None})
+            whole = {**{key: scene[key] for key in keys}, "rotation": rotation, **own}
+            bodies.append({**whole, "reconstructed": body.shape is None})
         return bodies
 
     def experiment_dt(self, name: str) -> float:
@@ -157,12 +159,17 @@ class Config(Section):
         return {"grid": captured.grid or self.captures.grid, "gravity": gravity}
 
     def obstacles(self, name: str) -> dict[str, Any]:
-        """Plain arguments of `neuma_lib.io.simulator.simulator` of a scene or an experiment with obstacles."""
+        """Plain arguments of `neuma_lib.io.simulator.simulator` of a scene or an experiment with obstacles or friction.
+
+        The faces of the cube have the friction of the scene, in an experiment of the first body's.
+        """
         base, _ = self.replicate(name)
-        of = self.experiments.get(base) or self.scenes[base]
-        lists = {"colliders": self.colliders(name)[1], "clamps": of.clamps}
+        experiment = self.experiments.get(base)
+        lists = {"colliders": self.colliders(name)[1], "clamps": (experiment or self.scenes[base]).clamps}
         plain = {key: [each.arguments() for each in entries] for key, entries in lists.items() if entries}
-        return plain | ({"contact": "particles"} if "colliders" in plain else {})
+        friction = self.scenes[experiment.bodies[0].scene if experiment else base].friction
+        plain |= {} if friction is None else {"boundary": friction}
+        return plain | ({"contact": "particles"} if plain.keys() & {"colliders", "boundary"} else {})
 
     def colliders(self, name: str) -> tuple[str, tuple[ColliderConfig, ...]]:
         """Path of the key with the colliders of a scene or an experiment, and them."""

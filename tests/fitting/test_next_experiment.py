@@ -300,10 +300,14 @@ def test_candidates_are_ranked_and_written(alone):
     """Launches and cameras together; the record reads back, and progress reaches the end."""
     chosen, calls = settings(), []
     fit = replace(alone.best, covariance=400 * alone.best.covariance)
-    lab = NextConfig(candidates=10)
+    lab = NextConfig(candidates=9)
     choice = choose_next(fit, [experiment()], chosen, lab, progress=lambda *each: calls.append(each))
-    assert calls[-1] == (10, 10) and len(choice.options) + choice.failed == 10
+    assert calls[-1] == (9, 9) and len(choice.options) + choice.failed == 9
     assert {option.kind for option in choice.options} == {"launch", "camera"}
+    assert {"rotation" in option.settings for option in choice.options if option.kind == "launch"} == {
+        False,
+        True,
+    }
     after = [option.after for option in choice.options]
     assert after == sorted(after) and after[0] < choice.before and choice.useful
     written = choice.as_dict()

@@ -373,7 +373,7 @@ FIGURES = {
         },
         "params": {
             "scenes": lambda wildcards: {
-                scene: scene_setting("shape", "size", "height", "center", "appearance")(
+                scene: scene_setting("shape", "size", "height", "center", "rotation", "appearance")(
                     SimpleNamespace(scene=scene)
                 )
                 for scene in DRAWN.obstacles
@@ -404,6 +404,12 @@ FIGURES = {
             "titles": titles_of("ablation_gradients"),
             "scenes": scenes_of("ablation_gradients"),
         },
+    },
+    "reliability": {
+        "kind": "json",
+        "input": {"records": expand(f"{RESULTS}/{{scene}}/calibration.json", scene=SETTINGS.random_scenes)},
+        "params": {},
+        "default_target": False,
     },
     "random_scenes": {
         "kind": "json",

@@ -20,7 +20,13 @@ def simulated(model, inputs, params):
     meshes = iter(listed(inputs.meshes))
     bodies = [
         TrueBody(
-            place(solid(body["shape"], meshes), body["size"], body["height"], body["center"]),
+            place(
+                solid(body["shape"], meshes),
+                body["size"],
+                body["height"],
+                body["center"],
+                rotation=body["rotation"],
+            ),
             analytic_law(body["law"], dt=model.dt),
             body["velocity"],
             body["density"],

@@ -26,7 +26,11 @@ def main(inputs, output, params, run) -> None:
     arrays, attributes = read_arrays(inputs.truth, only=names, required=names)
     steps = arrays["frames"].tolist() if params.moving else [0]
     mesh = place(
-        solid(scene["shape"], iter(listed(inputs.meshes))), scene["size"], scene["height"], scene["center"]
+        solid(scene["shape"], iter(listed(inputs.meshes))),
+        scene["size"],
+        scene["height"],
+        scene["center"],
+        rotation=scene["rotation"],
     )
     look = AppearanceConfig(**scene["appearance"])
     body = make_body(mesh, look, arrays["x"][: len(steps)], arrays["tracers"][: len(steps)])
