@@ -83,6 +83,8 @@ def _laws(settings: Config) -> Iterator[tuple[str, dict[str, Any]]]:
     for name, scene in settings.scenes.items():
         if scene.law is not None and name not in drawn:
             yield f"scenes.{name}.law", scene.law.plain()
+        for key, body in scene.bodies.items():
+            yield f"scenes.{name}.bodies.{key}.law", body.law.plain()
     for name, law in settings.priors.laws.items():
         yield f"priors.laws.{name}", law.plain()
     for name, law in settings.identify.families.items():
@@ -115,10 +117,12 @@ def _scene_problems(settings: Config, own_captures: bool = False) -> Iterator[st
         if own_captures:
             yield from map(str, prior_errors(settings, name))
         yield from _mesh_problems(*settings.colliders(name))
-        if scene.has_truth:
+        if scene.has_truth or scene.bodies:
             truth = settings.scene_truth(name)
-            yield from _start_problems(where, plain, scene.dt, world["grid"], *settings.colliders(name))
-            yield from _courant_problem(f"{where}.law", plain["law"], plain["density"], truth.grid, truth.dt)
+            for body in settings.scene_bodies(name):
+                own = f"{where}.bodies.{body['name']}" if scene.bodies else where
+                yield from _start_problems(own, body, scene.dt, world["grid"], *settings.colliders(name))
+                yield from _courant_problem(f"{own}.law", body["law"], body["density"], truth.grid, truth.dt)
         if scene.splat:
             reach = plain["size"] * math.sqrt(3) / 2
             yield from _speed_problem(where, plain, reach, scene.dt, world["grid"])
