@@ -19,7 +19,7 @@ from neuma_lib.io.mjcf import read_elasticity
 from neuma_lib.io.usd_particles import read_material
 from neuma_lib.mechanics.adaptor import AdaptableLaw
 from neuma_lib.mechanics.analytic import analytic_law, specification
-from neuma_lib.mechanics.catalogue import ELASTICITY, PLASTICITY
+from neuma_lib.mechanics.catalogue import at_length_scale
 from neuma_lib.mechanics.law import Law
 from neuma_lib.mechanics.structured import StructuredLaw
 
@@ -77,7 +77,7 @@ def law_for_engine(
                 f"a metre of its simulator is {1 / scale:.4g} m of the filmed world, which has other moduli"
             )
             raise InputError(f"law {law.name}", problem, "Convert it with --world, or export the scene")
-        spec, scale = _of_world(spec, scale), 1.0
+        spec, scale = at_length_scale(spec, 1 / scale), 1.0
     material = engine_material(spec, density, substep, engine)
     about = {**known, "law": spec, "density": density, "substep": substep, "scale": scale, "fit": errors}
     if fit or world:  # other constants than those that were estimated
@@ -151,16 +151,3 @@ def _fitted(law: Law, known, engine: str, states: Tensor | None, force: bool, su
             "Accept it with --force, or choose another engine",
         )
     return result.spec, result.errors
-
-
-def _of_world(spec: Mapping[str, Any], scale: float) -> dict[str, Any]:
-    """A law with constants of the filmed world: stresses and viscosities at the same density scale with length^2."""
-    return {
-        part: {
-            key: value / scale**2
-            if key in known[values["name"]] and "Pa" in known[values["name"]][key].unit
-            else value
-            for key, value in values.items()
-        }
-        for (part, values), known in zip(spec.items(), (ELASTICITY, PLASTICITY), strict=True)
-    }
