@@ -24,6 +24,8 @@ _GAP = 0.5
 cells, so that the body is held exactly from there on."""
 _PER_CELL = 2  # particles along an edge of a cell
 _COURANT = 0.7
+_NO_VOLUME = 1e-6
+"""Volume of a particle of a load, as a share of that of others."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,7 @@ class Beam:
         length, height, width: along x, y and z [m].
         density: [kg/m^3].
         gravity: acceleration along -y [m/s^2].
-        load: mass at the upper edge of the free end [kg], spread over one cell and the width.
+        load: mass at the upper edge of the free end [kg], spread over the width.
     """
 
     length: float
@@ -95,8 +97,12 @@ def clamped_beam(
     mass = beam.density * vol0
     centre = torch.tensor([root * dx, float(lower[1]) + beam.height / 2, edge / 2], dtype=torch.float64)
     if beam.load:
-        corner = (x[:, 0] > root * dx + beam.length - dx) & (x[:, 1] > lower[1] + beam.height - dx)
-        mass = mass + beam.load * corner / corner.sum()
+        edge_of_end = [root * dx + beam.length, float(lower[1]) + beam.height]
+        added = torch.tensor([[*edge_of_end, float(z)] for z in ticks[2] * size[2] + lower[2]], dtype=x.dtype)
+        x = torch.cat([x, added])
+        mass = torch.cat([mass, torch.full((len(added),), beam.load / len(added), dtype=x.dtype)])
+        # They carry mass and next to no stress.
+        vol0 = torch.cat([vol0, torch.full((len(added),), _NO_VOLUME * float(vol0[0]), dtype=x.dtype)])
     scaled = at_length_scale(spec, 1 / edge)
     dt = 1e-3
     for _ in range(20):  # the stiffness of a viscous part depends on dt
