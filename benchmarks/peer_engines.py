@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from importlib import import_module
 from multiprocessing.connection import Connection
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +22,17 @@ ANALYTIC = {
         "elasticity": {"name": "hencky", "E": 1e4, "nu": 0.3},
         "plasticity": {"name": "von_mises", "yield_stress": 5e2},
     },
+    "corotated_von_mises": {
+        "elasticity": {"name": "fixed_corotated", "E": 1e4, "nu": 0.3},
+        "plasticity": {"name": "von_mises", "yield_stress": 5e2},
+    },
 }
+ENGINES = {
+    "taichi": "benchmarks.peer_taichi:TaichiRollout",
+    "genesis": "benchmarks.peer_genesis:GenesisRollout",
+    "newton": "benchmarks.peer_newton:NewtonRollout",
+}
+"""Module and class of other engines by name."""
 
 
 @dataclass(frozen=True)
@@ -48,9 +59,14 @@ class Case:
     def title(self) -> str:
         return f"{self.law} {self.particles:,} / {self.grid}^3"
 
+    @property
+    def spec(self) -> dict[str, Any]:
+        """Of an analytic law."""
+        return ANALYTIC[self.law]
+
     def lame(self) -> tuple[float, float]:
         """Shear modulus and first Lame parameter [Pa]."""
-        E, nu = (ANALYTIC[self.law]["elasticity"][name] for name in ("E", "nu"))
+        E, nu = (self.spec["elasticity"][name] for name in ("E", "nu"))
         return E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu))
 
     def arrays(self) -> tuple[np.ndarray, np.ndarray, float, float, np.ndarray]:
@@ -68,23 +84,29 @@ class Case:
         return x, v, 1000 * spacing**3, spacing**3, direction
 
 
-class Engine(Protocol):
-    """A simulator prepared for a case."""
+class Rollout(ABC):
+    """A simulator prepared for a case on a device, "cpu" or "cuda"."""
 
+    def start(self, work: str) -> None:  # noqa: B027
+        """Return to the initial state, before `forward` or `forward_backward`. Not timed."""
+
+    @abstractmethod
     def forward(self) -> None:
         """Simulate all steps without a gradient."""
 
     def forward_backward(self) -> None:
         """Simulate all steps and differentiate the final positions along the case's direction."""
+        raise NotImplementedError
 
-    def result(self) -> tuple[np.ndarray, np.ndarray]:
-        """Final positions and gradient of the initial velocities after `forward_backward`."""
+    @abstractmethod
+    def result(self) -> tuple[np.ndarray, np.ndarray | None]:
+        """Final positions, and gradient of the initial velocities after `forward_backward`."""
 
 
-class OwnRollout:
-    """This project's rollout on one core, with the default contact, which nothing touches."""
+class OwnRollout(Rollout):
+    """This project's rollout, with the default contact, which nothing touches."""
 
-    def __init__(self, case: Case):
+    def __init__(self, case: Case, device: str):
         import torch
 
         from neuma_lib.mechanics.analytic import analytic_law
@@ -93,9 +115,9 @@ class OwnRollout:
         from neuma_lib.sim.state import State
 
         torch.set_num_threads(1)
-        x, v, m, vol0, direction = map(torch.as_tensor, case.arrays())
-        of_all = torch.ones(len(x))
-        self.state = State(x, v.requires_grad_(), m.float() * of_all, vol0.float() * of_all)
+        x, v, m, vol0, direction = (torch.as_tensor(each).float().to(device) for each in case.arrays())
+        of_all = torch.ones(len(x), device=device)
+        self.state = State(x, v.requires_grad_(), m * of_all, vol0 * of_all)
         self.direction, self.steps = direction, case.steps
         constants = model.MPM if hasattr(model, "MPM") else model.MPMModel  # its name in commit c62e703
         self.model = constants(case.grid, case.dt, case.gravity)
@@ -103,7 +125,8 @@ class OwnRollout:
             self.law = structured_law({**ANALYTIC["von_mises"], "form": "stretch"})
             self.law.attach_adaptor(rank=None)
         else:
-            self.law = analytic_law(ANALYTIC[case.law])
+            self.law = analytic_law(case.spec)
+        self.law.to(device)
 
     def _final_positions(self):
         from neuma_lib.sim.rollout import rollout
@@ -124,37 +147,46 @@ class OwnRollout:
         (self.x * self.direction).sum().backward()
 
     def result(self) -> tuple[np.ndarray, np.ndarray]:
-        return self.x.detach().numpy(), self.state.v.grad.numpy()
+        return self.x.detach().cpu().numpy(), self.state.v.grad.cpu().numpy()
 
 
-def timed(work: Callable[[], object]) -> tuple[float, float]:
+def timed(engine: Rollout, work: str, device: str) -> tuple[float, float]:
     """Core and wall seconds of the second of two calls. The first fills the caches that other engines have used."""
-    work()
-    started = time.process_time(), time.perf_counter()
-    work()
-    return time.process_time() - started[0], time.perf_counter() - started[1]
+
+    def clocks() -> tuple[float, float]:
+        if device == "cuda":
+            import torch
+
+            torch.cuda.synchronize()  # waits for all streams of the device, of any library
+        return time.process_time(), time.perf_counter()
+
+    engine.start(work)
+    getattr(engine, work)()
+    engine.start(work)
+    core, wall = clocks()
+    getattr(engine, work)()
+    core_end, wall_end = clocks()
+    return core_end - core, wall_end - wall
 
 
-def engine_for(name: str, case: Case) -> Engine:
-    """Plain Taichi if the name is "taichi", else the rollout of the imported `neuma_lib`."""
-    if name == "taichi":
-        from benchmarks.peer_taichi import TaichiRollout
-
-        return TaichiRollout(case)
-    return OwnRollout(case)
-
-
-def serve(name: str, parent: Connection) -> None:
-    """Answer orders: fields of a `Case` with the engine's result, the name of a method with its seconds, None ends."""
-    engine = None
+def serve(name: str, device: str, parent: Connection) -> None:
+    """Answer orders: work and fields of a `Case` with the engine's result, the name of a work with its seconds, None
+    ends."""
+    kind: Any = OwnRollout
+    if name in ENGINES:
+        module, own = ENGINES[name].split(":")
+        kind = getattr(import_module(module), own)
+    engine: Any = None
     while (order := parent.recv()) is not None:
-        if isinstance(order, dict):
-            engine = engine_for(name, Case(**order))
-            engine.forward_backward()
+        if isinstance(order, tuple):
+            work, case = order
+            engine = kind(Case(**case), device)
+            engine.start(work)
+            getattr(engine, work)()
             parent.send(engine.result())
         else:
-            parent.send(timed(getattr(engine, order)))
+            parent.send(timed(engine, order, device))
 
 
 if __name__ == "__main__":
-    serve(sys.argv[1], Connection(int(sys.argv[2])))
+    serve(sys.argv[1], sys.argv[2], Connection(int(sys.argv[3])))

@@ -14,7 +14,7 @@ in a minute and are cached on disk.
 import numpy as np
 import taichi as ti
 
-from benchmarks.peer_engines import Case
+from benchmarks.peer_engines import Case, Rollout
 
 VECTORS = ti.types.ndarray(dtype=ti.math.vec3, ndim=1)
 MIN_MASS = 1e-12
@@ -28,13 +28,15 @@ def spline(f):
 
 
 @ti.data_oriented
-class TaichiRollout:
-    """Rollout of a case on one core: `forward`, and `forward_backward` to the gradient of the initial velocities."""
+class TaichiRollout(Rollout):
+    """Rollout of a case: `forward`, and `forward_backward` to the gradient of the initial velocities."""
 
-    def __init__(self, case: Case):
+    def __init__(self, case: Case, device: str):
         if case.law != "neo_hookean":
             raise ValueError(f"{case.law} is not implemented in Taichi")
-        ti.init(arch=ti.cpu, cpu_max_num_threads=1, default_fp=ti.f32, log_level=ti.ERROR)
+        arch = ti.cuda if device == "cuda" else ti.cpu
+        ti.init(arch=arch, cpu_max_num_threads=1, default_fp=ti.f32, log_level=ti.ERROR)
+        self.serial = device == "cpu"
         x, v, self.m, self.vol0, direction = case.arrays()
         self.steps, self.n, self.dt = case.steps, case.grid, case.dt
         self.mu, self.lam, self.gravity = *case.lame(), ti.Vector(case.gravity)
@@ -45,10 +47,10 @@ class TaichiRollout:
         self.grid_m = ti.field(ti.f32, shape=nodes, needs_grad=True)
         self.direction = ti.Vector.field(3, ti.f32, shape=len(x))
         self.direction.from_numpy(direction)
-        self.start(x, v)
+        self.initialise(x, v)
 
     @ti.kernel
-    def start(self, x: VECTORS, v: VECTORS):
+    def initialise(self, x: VECTORS, v: VECTORS):
         """Initial state."""
         for p in range(self.x.shape[1]):
             self.x[0, p] = x[p]
@@ -74,7 +76,7 @@ class TaichiRollout:
 
         With columns a, b and c of A this is w_i (q + i a + j b + k c).
         """
-        ti.loop_config(serialize=True)  # on one thread, without which all additions are atomic
+        ti.loop_config(serialize=self.serial)  # one thread needs no atomic additions
         for p in range(self.x.shape[1]):
             F = self.F[s, p]
             tau = self.mu * (F @ F.transpose()) + ti.Matrix.identity(ti.f32, 3) * (
@@ -105,7 +107,7 @@ class TaichiRollout:
     @ti.kernel
     def g2p(self, s: ti.i32):
         """v = sum w_i v_i,  C = (4 / dx) sum w_i v_i d_i^T,  x += dt v,  F = (I + dt C) F."""
-        ti.loop_config(serialize=True)  # on one thread, without which all additions are atomic
+        ti.loop_config(serialize=self.serial)  # one thread needs no atomic additions
         for p in range(self.x.shape[1]):
             cells = self.x[s, p] * self.n
             base = ti.cast(cells - 0.5, ti.i32)

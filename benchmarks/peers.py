@@ -1,16 +1,19 @@
-"""Time of a step on one core, forward and with backward, compared with plain Taichi and with a former commit.
+"""Time of a step, forward and with gradients, compared with Taichi, Genesis, newton and a former commit.
 
-    pip install taichi                                          # 1.7.4, on no list of requirements
-    taskset -c 0 python -m benchmarks.peers
+    pip install taichi genesis-world "newton[sim]"               # 1.7.4, 1.4.5, 1.8.0; docs/engines.md
+    taskset -c 0 python -m benchmarks.peers                       # those that are installed, on one core
+    python -m benchmarks.peers --device cuda                      # on a GPU
     git worktree add ../former c62e703
-    taskset -c 0 python -m benchmarks.peers --against ../former    # and with that commit of this project
-    taskset -c 0 python -m benchmarks.peers --no-taichi --against ../former
+    taskset -c 0 python -m benchmarks.peers --peers --against ../former     # that commit of this project only
 
-A cube in free flight stretches and shears for 50 steps in float32. Each engine runs in its process, one at a time, and
-all take turns in every round. Before times are printed, engines must agree in the final positions and in the gradient
-of a random linear function of these with respect to the initial velocities. Only neo-Hookean cases run in Taichi
-(`benchmarks.peer_taichi`), which has no walls and no checks of faults. Times are core seconds, which load disturbs less
-than wall time. A ratio above 1 is slower than this checkout.
+A cube in free flight stretches and shears for 50 steps in float32. Each engine runs in its process, one at a time,
+and all take turns in every round. Engines run the cases whose law they have: Taichi (`benchmarks.peer_taichi`,
+without walls and checks of faults) neo-Hookean, Genesis also fixed-corotated with von Mises, newton Hencky with von
+Mises. Before times are printed, engines must agree in the final positions and in the gradient of a random linear
+function of these with respect to the initial velocities. newton's implicit steps have no gradient and only
+approximately the same positions.
+
+Times on a CPU are core seconds, which load disturbs less than wall time. A ratio above 1 is slower than this checkout.
 """
 
 from __future__ import annotations
@@ -24,6 +27,7 @@ from dataclasses import asdict
 from multiprocessing import Pipe
 from pathlib import Path
 from statistics import median
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,20 +36,49 @@ from benchmarks.peer_engines import Case
 from benchmarks.timing import parser_of
 from neuma_lib.errors import InputError
 
-CASES = (
-    Case("neo_hookean", 2197, 24),
-    Case("neo_hookean", 19683, 64),
-    Case("von_mises", 2197, 24),
-    Case("structured", 2000, 24),
-)
+CASES = {
+    "cpu": (
+        Case("neo_hookean", 2197, 24),
+        Case("neo_hookean", 19683, 64),
+        Case("von_mises", 2197, 24),
+        Case("corotated_von_mises", 2197, 24),
+        Case("structured", 2000, 24),
+    ),
+    "cuda": (
+        Case("neo_hookean", 19683, 64),
+        Case("neo_hookean", 262144, 128),
+        Case("von_mises", 19683, 64),
+        Case("von_mises", 262144, 128),
+        Case("corotated_von_mises", 262144, 128),
+    ),
+}
 WORK = {"forward": "forward", "forward_backward": "with backward"}
-OWN, OTHER, TAICHI = "this checkout", "other checkout", "taichi"
-MAX_DISTANCE = 1e-5
-"""Largest distance between the final positions of two engines [m]."""
+OWN, OTHER = "this checkout", "other checkout"
 MAX_GRADIENT_ERROR = 1e-3
 """Largest norm of the difference of two gradients, relative to the norm of ours."""
 
-Result = tuple[np.ndarray, np.ndarray]
+
+class Peer(NamedTuple):
+    """What an engine can do.
+
+    Attributes:
+        laws: of the cases that it runs. None: all.
+        works: keys of `WORK`.
+        distance: between its final positions and ours, at most [m].
+    """
+
+    laws: tuple[str, ...] | None = None
+    works: tuple[str, ...] = tuple(WORK)
+    distance: float = 1e-5
+
+
+PEERS = {
+    "taichi": Peer(("neo_hookean",)),
+    "genesis": Peer(("neo_hookean", "corotated_von_mises")),
+    "newton": Peer(("von_mises",), ("forward",), 5e-3),
+}
+
+Result = tuple[np.ndarray, np.ndarray | None]
 Times = dict[tuple[str, str], list[tuple[float, float]]]
 """Core and wall seconds of every round by engine and work."""
 
@@ -53,13 +86,13 @@ Times = dict[tuple[str, str], list[tuple[float, float]]]
 class Child:
     """An engine in its process, which imports `neuma_lib` from a checkout."""
 
-    def __init__(self, name: str, checkout: Path):
-        self.name = name
+    def __init__(self, name: str, checkout: Path, device: str = "cpu"):
+        self.name, self.peer = name, PEERS.get(name, Peer())
         self.connection, other = Pipe()
         paths = [str(checkout), *filter(None, [os.environ.get("PYTHONPATH")])]
         self.process = subprocess.Popen(
             # -P: without the folder of the script, which would hide packages of the other checkout
-            [sys.executable, "-P", peer_engines.__file__, name, str(other.fileno())],
+            [sys.executable, "-P", peer_engines.__file__, name, device, str(other.fileno())],
             env={**os.environ, "PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"},
             pass_fds=[other.fileno()],
             stdout=sys.stderr,
@@ -68,10 +101,10 @@ class Child:
 
     def prepare(self, case: Case) -> Result:
         """Final positions and gradient of a case, after compilation."""
-        return self._answer(asdict(case))
+        return self._answer((self.peer.works[-1], asdict(case)))
 
     def seconds(self, work: str) -> tuple[float, float]:
-        """Core and wall time of a method of `peer_engines.Engine`."""
+        """Core and wall time of a method of `peer_engines.Rollout`."""
         return self._answer(work)
 
     def _answer(self, order):
@@ -88,14 +121,13 @@ class Child:
         self.process.wait()
 
 
-def require_taichi() -> None:
-    """Raise InputError without the package."""
-    if importlib.util.find_spec("taichi") is None:
-        raise InputError(
-            "taichi",
-            "the package is not installed",
-            "Install it with `pip install taichi`, or use --no-taichi",
-        )
+def installed(names: Sequence[str] | None) -> list[str]:
+    """The named peers, or all that are installed. Raises InputError for one that is not."""
+    there = [name for name in PEERS if importlib.util.find_spec(name) is not None]
+    for name in names or ():
+        if name not in there:
+            raise InputError(name, "the package is not installed", "Install it, or name other --peers")
+    return there if names is None else list(names)
 
 
 def checked_checkout(path: Path) -> Path:
@@ -107,41 +139,51 @@ def checked_checkout(path: Path) -> Path:
 
 
 def differences(own: Result, other: Result) -> tuple[float, float]:
-    """Largest distance of final positions [m], and relative error of the gradient."""
+    """Largest distance of final positions [m], and relative error of the gradient, which is 0 if there is none."""
     (x, grad), (other_x, other_grad) = own, other
-    error = np.linalg.norm(other_grad - grad) / np.linalg.norm(grad)
-    return float(np.linalg.norm(other_x - x, axis=1).max()), float(error)
+    error = 0.0
+    if grad is not None and other_grad is not None:
+        error = float(np.linalg.norm(other_grad - grad) / np.linalg.norm(grad))
+    return float(np.linalg.norm(other_x - x, axis=1).max()), error
 
 
-def agree(distance: float, error: float) -> bool:
+def agree(distance: float, error: float, peer: Peer = PEERS["taichi"]) -> bool:
     """Whether two engines simulate the same. False for NaN."""
-    return distance <= MAX_DISTANCE and error <= MAX_GRADIENT_ERROR
+    return distance <= peer.distance and error <= MAX_GRADIENT_ERROR
 
 
 def interleaved(engines: Sequence[Child], rounds: int) -> Times:
     """Times of all engines, which take turns in each round, in the opposite order in every second one."""
-    times = {(engine.name, work): [] for work in WORK for engine in engines}
+    times = {(engine.name, work): [] for work in WORK for engine in engines if work in engine.peer.works}
     for n in range(rounds):
         for work in WORK:
             for engine in engines[:: 1 if n % 2 == 0 else -1]:
-                times[engine.name, work].append(engine.seconds(work))
+                if work in engine.peer.works:
+                    times[engine.name, work].append(engine.seconds(work))
     return times
 
 
-def table(times: Times, steps: int) -> str:
-    """Median and minimum of a step, and median and extremes of the paired ratio to this checkout, in core time."""
-    lines = [f"{'a step [ms]':32}{'median':>9}{'minimum':>9}{'wall':>9}{'ratio':>8}   of rounds"]
+def table(times: Times, steps: int, clock: int = 0) -> str:
+    """Median and minimum of a step, and median and extremes of the paired ratio to this checkout.
+
+    Args:
+        clock: 0 for core time, 1 for wall time. The other median is printed too.
+    """
+    words = ("core", "wall")[:: 1 - 2 * clock]
+    lines = [
+        f"{'a step [ms], ' + words[0]:32}{'median':>9}{'minimum':>9}{words[1]:>9}{'ratio':>8}   of rounds"
+    ]
     for (name, work), seconds in times.items():
-        cores, walls = zip(*seconds, strict=True)
-        ratios = [core / own for core, (own, _) in zip(cores, times[OWN, work], strict=True)]
-        columns = "".join(f"{1e3 * t / steps:9.3f}" for t in (median(cores), min(cores), median(walls)))
+        own, other = ([pair[k] for pair in seconds] for k in (clock, 1 - clock))
+        ratios = [t / mine[clock] for t, mine in zip(own, times[OWN, work], strict=True)]
+        columns = "".join(f"{1e3 * t / steps:9.3f}" for t in (median(own), min(own), median(other)))
         lines.append(
             f"{WORK[work]:16}{name:16}{columns}{median(ratios):8.2f}   {min(ratios):.2f} to {max(ratios):.2f}"
         )
     return "\n".join(lines)
 
 
-def compare(case: Case, engines: Sequence[Child], rounds: int) -> str:
+def compare(case: Case, engines: Sequence[Child], rounds: int, clock: int = 0) -> str:
     """Agreement and times of a case. The first engine is this checkout.
 
     Raises:
@@ -152,19 +194,22 @@ def compare(case: Case, engines: Sequence[Child], rounds: int) -> str:
     lines = [f"{case.title}, {case.steps} steps, particles move up to {moved:.3f} m"]
     for engine, other in zip(engines[1:], others, strict=True):
         distance, error = differences(own, other)
-        lines.append(f"  {engine.name}: positions differ by {distance:.1e} m, gradients by {error:.1e}")
-        if not agree(distance, error):
-            limits = f"at most {MAX_DISTANCE:g} m and {MAX_GRADIENT_ERROR:g}"
+        gradients = "no gradient" if other[1] is None else f"gradients by {error:.1e}"
+        lines.append(f"  {engine.name}: positions differ by {distance:.1e} m, {gradients}")
+        if not agree(distance, error, engine.peer):
+            limits = f"at most {engine.peer.distance:g} m and {MAX_GRADIENT_ERROR:g}"
             raise RuntimeError(
                 "\n".join([*lines, f"not the same simulation, which needs {limits}: no times"])
             )
-    return "\n".join([*lines, table(interleaved(engines, rounds), case.steps)])
+    return "\n".join([*lines, table(interleaved(engines, rounds), case.steps, clock)])
 
 
 def main() -> None:
     parser = parser_of(__doc__)
     parser.add_argument("--rounds", type=int, default=9)
-    parser.add_argument("--no-taichi", action="store_true")
+    parser.add_argument("--device", choices=list(CASES), default="cpu")
+    peers = "engines (default: all that are installed; nothing after it: none)"
+    parser.add_argument("--peers", nargs="*", metavar="NAME", choices=list(PEERS), help=peers)
     parser.add_argument("--against", type=Path, metavar="PATH", help="another checkout of this project")
     args = parser.parse_args()
 
@@ -172,14 +217,13 @@ def main() -> None:
     checkouts = {OWN: here}
     if args.against:
         checkouts[OTHER] = checked_checkout(args.against)
-    if not args.no_taichi:
-        require_taichi()
-        checkouts[TAICHI] = here
-    engines = [Child(name, checkout) for name, checkout in checkouts.items()]
+    checkouts |= dict.fromkeys(installed(args.peers), here)
+    engines = [Child(name, checkout, args.device) for name, checkout in checkouts.items()]
     try:
-        for case in CASES:
-            able = [each for each in engines if each.name != TAICHI or case.law == "neo_hookean"]
-            print(f"{compare(case, able, args.rounds)}\nload average {os.getloadavg()[0]:.1f}\n", flush=True)
+        for case in CASES[args.device]:
+            able = [each for each in engines if each.peer.laws is None or case.law in each.peer.laws]
+            result = compare(case, able, args.rounds, int(args.device == "cuda"))
+            print(f"{result}\nload average {os.getloadavg()[0]:.1f}\n", flush=True)
     finally:
         for engine in engines:
             engine.close()

@@ -51,7 +51,12 @@ def chosen_scenes(args: argparse.Namespace) -> dict[str, Config]:
 def simulation(settings: Config, scene: SceneConfig) -> dict[str, Any]:
     """Constants of the simulator for a scene's reconstruction, as `MPM` takes them."""
     known = settings.simulation.plain()
-    return {"dt": scene.dt, **{key: known[key] for key in ("grid", "gravity", "boundary", "contact")}}
+    friction = {} if scene.friction is None else {"boundary": scene.friction, "contact": "particles"}
+    return {
+        "dt": scene.dt,
+        **{key: known[key] for key in ("grid", "gravity", "boundary", "contact")},
+        **friction,
+    }
 
 
 def simulator(settings: Config, scene: SceneConfig) -> MPM:

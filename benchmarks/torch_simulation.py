@@ -3,12 +3,13 @@
 import torch
 
 from neuma_lib.mechanics.catalogue import viscous_branch
+from neuma_lib.sim.body_contact import CERTAIN, CHOICE, COMMON, REACH
 from neuma_lib.sim.clamps import HELD_SHARE, clamped_particles
 from neuma_lib.sim.colliders import CONTACT_STIFFNESS, contact_radius
 from neuma_lib.sim.model import as_regions
 
 
-def step(model, bodies, x, v, F, C, stuck, mass, vol0, time=0.0, clamp=None, over=0.0):
+def step(model, regions, x, v, F, C, stuck, mass, vol0, time=0.0, clamp=None, over=0.0, bodies=()):
     """One step of the paper's Algorithm 2 with all 27 nodes of a particle as one axis.
 
     Args:
@@ -16,9 +17,10 @@ def step(model, bodies, x, v, F, C, stuck, mass, vol0, time=0.0, clamp=None, ove
         time: of the step [s], for moving colliders and clamps.
         clamp: index of the clamp of each particle, or -1, shape (N,).
         over: Kirchhoff stress of viscous branches [Pa], shape (N, 3, 3).
+        bodies: number of particles of each body, if there are several.
     """
     n, dx, dt = model.nodes, model.dx, model.dt
-    tau = evaluate(bodies, "elasticity", F) + over
+    tau = evaluate(regions, "elasticity", F) + over
     clamp = torch.full_like(mass, -1) if clamp is None else clamp
     held = [(each, clamp == k) for k, each in enumerate(model.clamps) if each.holds(time, dt)]
     free = ~sum((mine for _, mine in held), start=torch.zeros_like(mass, dtype=torch.bool))
@@ -35,16 +37,23 @@ def step(model, bodies, x, v, F, C, stuck, mass, vol0, time=0.0, clamp=None, ove
     weight = w[:, i, 0] * w[:, j, 1] * w[:, k, 2]
     d = (offset - f[:, None]) * dx
     node = base[:, None] + offset
-    flat = (node[..., 0] * n + node[..., 1]) * n + node[..., 2]
+    count = max(1, len(bodies))
+    body = torch.arange(count).repeat_interleave(torch.tensor(bodies or (len(x),)))
+    flat = ((body[:, None] * n + node[..., 0]) * n + node[..., 1]) * n + node[..., 2]
 
     A = mass[:, None, None] * C - (4 * dt / dx**2) * vol0[:, None, None] * tau
     q = (mass[:, None] * v)[:, None] + torch.einsum("pab,pib->pia", A, d)
-    m = x.new_zeros(n**3).index_add(0, flat.flatten(), (weight * mass[:, None]).flatten())
-    mv = x.new_zeros(n**3, 3).index_add(0, flat.flatten(), (weight[..., None] * q).flatten(0, 1))
+    m = x.new_zeros(count * n**3).index_add(0, flat.flatten(), (weight * mass[:, None]).flatten())
+    mv = x.new_zeros(count * n**3, 3).index_add(0, flat.flatten(), (weight[..., None] * q).flatten(0, 1))
 
     gravity = x.new_tensor(model.gravity)
     grid_v = torch.where(m[:, None] > 0, mv / m.clamp(min=1e-300)[:, None] + dt * gravity, 0.0)
-    grid_v = walls(model, grid_v.reshape(n, n, n, 3)).reshape(-1, 3)
+    grid_v = torch.cat([walls(model, own.reshape(n, n, n, 3)).reshape(-1, 3) for own in grid_v.chunk(count)])
+    if bodies:
+        volumes, masses = (values.detach().split(bodies) for values in (vol0, mass))
+        per_mass = [float(a.sum() / b.sum()) / dx**3 for a, b in zip(volumes, masses, strict=True)]
+        grid_v = body_contact(model, grid_v.reshape(count, n, n, n, 3), m.reshape(count, n, n, n), per_mass)
+        grid_v = grid_v.reshape(-1, 3)
     nodes = torch.cartesian_prod(*[torch.arange(n)] * 3).to(x) * dx + model.first_node * dx
     held_mass = [
         m.new_zeros(n**3).index_add(0, flat[mine].flatten(), (weight * all_mass[:, None])[mine].flatten())
@@ -62,7 +71,7 @@ def step(model, bodies, x, v, F, C, stuck, mass, vol0, time=0.0, clamp=None, ove
     x = x + dt * v
     if model.bounds_positions:
         x = x.clamp(*model.stencil_range)
-    F = evaluate(bodies, "plasticity", F + dt * C @ F)
+    F = evaluate(regions, "plasticity", F + dt * C @ F)
     return x, v, F, C, stuck
 
 
@@ -96,6 +105,45 @@ def touched(collider, x, v, stuck, radius, dt, time):
     return torch.where(touches, after, v), torch.where(touches, moved, stuck), touches[:, 0]
 
 
+def body_contact(model, v, m, per_mass):
+    """Velocities (B, n, n, n, 3) of the nodes of B bodies after contact, from those before and the masses (B, n, n, n).
+
+    See `neuma_lib.sim.body_contact`. ``per_mass`` is the volume fraction of a node per mass of each body.
+    """
+    frictions = {(pair.first, pair.second): min(pair.friction, 1e12) for pair in model.pairs}
+    fractions = m * m.new_tensor(per_mass)[:, None, None, None]
+    mean, step = m.new_tensor([0.25, 0.5, 0.25]), m.new_tensor([-0.5, 0.0, 0.5])
+    kernels = [
+        torch.einsum("i,j,k->ijk", *(step if axis == own else mean for axis in range(3))) for own in range(4)
+    ]
+    around = torch.nn.functional.conv3d(fractions[:, None], torch.stack(kernels)[:, None], padding=1)
+    g, f = around[:, :3].movedim(1, -1), around[:, 3]
+    after = list(v)
+    for a in range(len(v)):
+        for b in range(a + 1, len(v)):
+            at = (m[a] > 0) & (m[b] > 0) & (g[a] != 0).any(dim=-1) & (g[b] != 0).any(dim=-1)
+            f_a, f_b, g_a, g_b = f[a][at], f[b][at], g[a][at], g[b][at]
+            n_a, n_b = g_a / g_a.norm(dim=-1, keepdim=True), -g_b / g_b.norm(dim=-1, keepdim=True)
+            depths = g_a / f_a[:, None] - g_b / f_b[:, None]
+            choice = (g_a.norm(dim=-1) / g_b.norm(dim=-1)).log() + (depths * (n_a - n_b)).sum(dim=-1)
+            n = torch.lerp(n_b, n_a, torch.sigmoid(CHOICE * choice.clamp(-CERTAIN, CERTAIN))[:, None])
+            n = n / n.norm(dim=-1, keepdim=True)
+            gap, relative = (depths * n).sum(dim=-1) - 2, (v[a] - v[b])[at]
+            p = -(n * relative).sum(dim=-1)
+            touches = (gap < REACH) & (p > 0)
+            q = relative + p[:, None] * n
+            force = torch.where(touches[:, None], q, 1.0).norm(dim=-1)
+            limit = frictions.get((a, b), 1e12) * p
+            q = torch.where((force > limit)[:, None], (limit / force)[:, None] * q, q)
+            strength = (f_a * f_b / (f_a + f_b) / COMMON).clamp(max=1) * (1 - gap / REACH).clamp(max=1)
+            jump = torch.where(touches, strength, 0.0)[:, None] * (p[:, None] * n - q)
+            total = m.sum(dim=0)[at]
+            for own, other, sign in ((a, b, 1), (b, a, -1)):
+                change = sign * (m[other][at] / total)[:, None] * jump
+                after[own] = after[own].index_put((at,), change, accumulate=True)
+    return torch.stack(after)
+
+
 def rigid_velocity(motion, x, time, dt):
     """Velocities (..., 3) with which points x (..., 3) of a moving frame reach their next place, and the gradient."""
     (axes, centre), (next_axes, next_centre) = (
@@ -127,32 +175,32 @@ def walls(model, grid_v):
     return grid_v
 
 
-def evaluate(bodies, part, F):
-    """Elasticity or plasticity of every body."""
-    return torch.cat([getattr(body.law, part)(F[body.start : body.stop]) for body in bodies])
+def evaluate(regions, part, F):
+    """Elasticity or plasticity of every region."""
+    return torch.cat([getattr(region.law, part)(F[region.start : region.stop]) for region in regions])
 
 
-def branch(bodies, F):
+def branch(regions, F):
     """Logarithmic strains (N, 3) of the viscous branches without their mean, their axes (N, 3, 3), and the shear moduli
     and relaxation times of their laws (N, 1)."""
     values, axes = torch.linalg.eigh(F @ F.mT)
     log = 0.5 * values.log()
     constants = [
-        viscous_branch(body.law.viscosity.values) for body in bodies for _ in range(body.start, body.stop)
+        viscous_branch(own.law.viscosity.values) for own in regions for _ in range(own.start, own.stop)
     ]
     G, T = (torch.stack([torch.as_tensor(c[k], dtype=F.dtype) for c in constants])[:, None] for k in (0, 1))
     return log - log.mean(1, keepdim=True), axes, G, T
 
 
-def overstress(bodies, F):
+def overstress(regions, F):
     """Kirchhoff stress 2 G dev eps of the branches (N, 3, 3)."""
-    strain, axes, G, _ = branch(bodies, F)
+    strain, axes, G, _ = branch(regions, F)
     return axes @ torch.diag_embed(2 * G * strain) @ axes.mT
 
 
-def relaxed(bodies, F, dt):
+def relaxed(regions, F, dt):
     """F (N, 3, 3) of the branches after an implicit step of the relaxation of their strain."""
-    strain, axes, _, T = branch(bodies, F)
+    strain, axes, _, T = branch(regions, F)
     return axes @ torch.diag_embed((strain / (1 + dt / T) - strain).exp()) @ axes.mT @ F
 
 
@@ -161,19 +209,22 @@ def rollout(model, law, state, frames, total=False):
 
     Each has the shape (T, N, ...). With a viscous part of all laws, the state has an F_branch.
     """
-    bodies = as_regions(law, len(state.x))
+    regions = as_regions(law, len(state.x))
     now, stuck, seen = state.motion, torch.zeros_like(state.x), []
     F_total = (state.F,) if total else ()
     clamp = clamped_particles(model.clamps, state.x) if state.clamp is None else state.clamp
-    viscous, F_branch, over = bodies[0].law.viscosity is not None, state.F_branch, 0.0
+    viscous, F_branch, over = regions[0].law.viscosity is not None, state.F_branch, 0.0
     for n in range(frames[-1] + 1):
         if n in frames:
             seen.append((*now, *F_total))
         if n < frames[-1]:
             if viscous:
-                over = overstress(bodies, F_branch)
-            *now, stuck = step(model, bodies, *now, stuck, state.mass, state.vol0, n * model.dt, clamp, over)
+                over = overstress(regions, F_branch)
+            particles = state.mass, state.vol0
+            *now, stuck = step(
+                model, regions, *now, stuck, *particles, n * model.dt, clamp, over, state.bodies
+            )
             if viscous:
-                F_branch = relaxed(bodies, F_branch + model.dt * now[3] @ F_branch, model.dt)
+                F_branch = relaxed(regions, F_branch + model.dt * now[3] @ F_branch, model.dt)
             F_total = tuple(F + model.dt * now[3] @ F for F in F_total)
     return tuple(torch.stack(values) for values in zip(*seen, strict=True))

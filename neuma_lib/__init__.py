@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from neuma_lib.mechanics.law import Elasticity, Law, Plasticity
     from neuma_lib.methods.base import Method
     from neuma_lib.methods.registry import METHODS
+    from neuma_lib.sim.bodies import Pair
     from neuma_lib.sim.model import MPM
     from neuma_lib.sim.rollout import rollout, simulate
     from neuma_lib.sim.state import State, Trajectory
@@ -44,6 +45,7 @@ __all__ = [
     "MPM",
     "Method",
     "NonFiniteError",
+    "Pair",
     "Plasticity",
     "Reconstruction",
     "Scene",
@@ -69,6 +71,7 @@ _PUBLIC = {
     "mechanics.law": "Elasticity Law Plasticity",
     "methods.base": "Method",
     "methods.registry": "METHODS",
+    "sim.bodies": "Pair",
     "sim.model": "MPM",
     "sim.rollout": "rollout simulate",
     "sim.state": "State Trajectory",

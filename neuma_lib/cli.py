@@ -65,6 +65,9 @@ def _parser() -> argparse.ArgumentParser:
     scene.add_argument("name", metavar="NAME", help="name of the scene and of its folder in results/")
     mesh = "shape of the object, .obj, .ply, .stl or .glb with y up; copied to meshes/ if outside the project"
     scene.add_argument("--mesh", metavar="FILE", help=mesh)
+    chosen = "results of a scene with next.md: the scene of the experiment that it lists first, or --rank"
+    scene.add_argument("--from", dest="source", metavar="FOLDER", help=chosen)
+    scene.add_argument("--rank", type=int, default=1, help="rank of that experiment (default %(default)s)")
     capture = _command(
         new,
         _new_capture,
@@ -83,6 +86,18 @@ def _parser() -> argparse.ArgumentParser:
     )
     files = f"{CONFIGFILE}; or a capture.yaml. None: config/config.yaml alone"
     check.add_argument("files", nargs="*", metavar="FILE", help=files)
+
+    following = _command(
+        commands,
+        _next,
+        "next: rank what to film next to learn more about a material",
+        "Ranks launches and second cameras by what they are expected to add to an identified material, and writes "
+        "next.md, next.json and next.png to the folder. The section `next` of the settings has the limits of the lab. "
+        "Example: neuma next results/ClayCat",
+    )
+    following.add_argument("folder", metavar="FOLDER", help="folder of an identified scene, in results/")
+    following.add_argument("--cores", type=int, default=2, help="CPU cores to use (default %(default)s)")
+    following.add_argument("--configfile", nargs="+", default=[], metavar="FILE", help=CONFIGFILE)
 
     law = _group(commands, "law", "export a learned material to one file, or show such a file")
     export = _command(
@@ -270,10 +285,42 @@ def _demo(options: argparse.Namespace) -> int:
     return status
 
 
-def _new_scene(options: argparse.Namespace) -> None:
-    from neuma_lib.project.project import Project
-    from neuma_lib.project.scaffold import new_scene
+def _next(options: argparse.Namespace) -> int:
+    from neuma_lib.extras import require
+    from neuma_lib.project.project import Project, remembered_settings
 
+    folder = Path(options.folder).absolute()
+    settings, root = Project.find(folder, options.configfile)
+    settings.scene(folder.name)
+    if not (folder / "identified.json").is_file():
+        problem = "does not exist, so the material has not been identified"
+        remedy = f"Run `snakemake --cores {options.cores} {options.folder}/identified.json` first"
+        raise InputError(folder / "identified.json", problem, remedy)
+    require("snakemake", "workflow")
+    files = [Path(file).absolute() for file in options.configfile] or remembered_settings(folder, root)
+    command = [sys.executable, "-m", "snakemake", f"--cores={options.cores}"]
+    command += ["--configfile", *map(str, files)] if files else []
+    page = folder / "next.md"
+    status = subprocess.run([*command, "--", str(page.relative_to(root))], cwd=root).returncode
+    if status == 0:
+        print("\n".join(line for line in page.read_text().splitlines() if line[:2] in ("1.", "2.", "3.")))
+        print(f"All candidates and pictures: {page}")
+    return status
+
+
+def _new_scene(options: argparse.Namespace) -> None:
+    from neuma_lib.project.project import Project, remembered_settings
+    from neuma_lib.project.scaffold import new_scene, next_scene
+
+    if options.source:
+        folder = Path(options.source).absolute()
+        settings, root = Project.find(folder)
+        file = next_scene(root, options.name, settings, folder, options.rank).relative_to(root)
+        files = [*(path.relative_to(root) for path in remembered_settings(folder, root)), file]
+        target = (folder / "identified.json").relative_to(root)
+        print(f"Created {file}. To render it and identify both videos together, run in {root}:")
+        print(f"  snakemake --cores 2 --configfile {' '.join(map(str, files))} -- {target}")
+        return
     settings, root = Project.find(".")
     file, name = new_scene(root, options.name, settings, options.mesh).relative_to(root), options.name
     print(f"Created {file}. Edit it, then run in {root}:")
@@ -366,21 +413,19 @@ def _export(options: argparse.Namespace) -> None:
 
 
 def _export_to_engine(options: argparse.Namespace, law: Law, known: dict[str, Any]) -> None:
-    from neuma_lib.export.laws import USD, law_for_engine, write_engine_law
+    from neuma_lib.export.laws import law_for_engine
     from neuma_lib.export.materials import ENGINES, check_engine
+    from neuma_lib.export.scenes import write_law_scene
 
-    check_engine(options.engine, (*ENGINES, USD))
-    engine = "newton" if options.engine == USD else options.engine
-    if options.engine == USD and Path(options.target).suffix != ".usda":
+    check_engine(options.engine, (*ENGINES, "usd"))
+    engine = "newton" if options.engine == "usd" else options.engine
+    if options.engine == "usd" and Path(options.target).suffix != ".usda":
         raise InputError(options.target, "the suffix is not .usda", "Give the file that suffix")
     if options.weight != 1.0 or options.page or options.separate_adaptor:
         raise InputError("--engine", "has no --weight, --page or --separate", "Leave them out")
-    names = ("density", "substep", "fit", "force", "world")
-    states = _visited_states(known)
-    material, about = law_for_engine(
-        law, known, engine, states=states, **{name: getattr(options, name) for name in names}
-    )
-    write_engine_law(options.target, engine, material, about)
+    own = {name: getattr(options, name) for name in ("density", "substep", "fit", "force", "world")}
+    material, about = law_for_engine(law, known, engine, states=_visited_states(known), **own)
+    write_law_scene(options.target, engine, material, about)
     _print_material(options.target, material, about)
 
 
@@ -433,12 +478,12 @@ def _scene_export(options: argparse.Namespace) -> None:
     frames = scene.video.frames if scene.video else scene.truth.frames if scene.truth else (0, 400)
     every = min(b - a for a, b in zip(frames[:-1], frames[1:], strict=True))
     own = EngineScene.of(scene.mpm, scene.state(), frames[-1], every, scene.reconstruction.gaussians)
-    known["scale"] = None  # the whole scene keeps the scale of the simulator
+    scale, known["scale"] = known.get("scale"), None  # the whole scene keeps the scale of the simulator
     material, about = law_for_engine(
         law, known, options.engine, density=own.density, substep=own.dt, fit=options.fit, force=options.force,
         states=_visited_states(known),
     )  # fmt: skip
-    notes = export_scene(options.target, options.engine, own, about["law"], about)
+    notes = export_scene(options.target, options.engine, own, about["law"], {**about, "scale": scale or 1.0})
     _print_material(options.target, material._replace(notes=tuple(notes)), about)
     print(f"Play it with: python {options.target}/run.py")
 

@@ -11,7 +11,9 @@ import trimesh
 import yaml
 
 from neuma_lib.cli import main
+from neuma_lib.io.files import write_json
 from neuma_lib.project import checks
+from neuma_lib.project.project import Project
 
 ROOT = Path(__file__).resolve().parents[1]
 core = pytest.mark.core
@@ -223,3 +225,44 @@ def test_check_loads_no_torch(project):
     code = "import sys; from neuma_lib.cli import main; main(['check']); "
     code += "sys.exit(len({'torch', 'warp'} & {*sys.modules}))"
     subprocess.run([sys.executable, "-c", code], check=True, env={"PYTHONPATH": str(ROOT), "PATH": ""})
+
+
+def chosen(project, kind, **settings):
+    """A folder of results of the duck with one chosen experiment."""
+    folder = project / "results" / "JellyDuck"
+    folder.mkdir(parents=True)
+    write_json(folder / "next.json", {"candidates": [{"kind": kind, "settings": settings}]})
+    return folder
+
+
+@core
+def test_a_chosen_launch_becomes_a_scene_of_the_same_material(project, capsys):
+    launch = {"height": 0.5, "velocity": [0.0, -2.0, 0.0], "spin": [0.0, 1.0, 0.0], "steps": 256}
+    folder = chosen(project, "launch", **launch)
+    assert main(["new", "scene", "Second", "--from", "results/JellyDuck"]) == 0
+    assert "--configfile config/Second.yaml -- results/JellyDuck/identified.json" in capsys.readouterr().out
+    assert main(["check", "config/Second.yaml"]) == 0, capsys.readouterr().out
+    settings, _ = Project.find(project, ["config/Second.yaml"])
+    assert settings.video_scenes("JellyDuck") == ["JellyDuck", "Second"]
+    scene = settings.scene("Second")
+    assert scene.height == 0.5 and scene.velocity == (0.0, -2.0, 0.0) and scene.steps == 256
+    assert scene.law == settings.scene("JellyDuck").law
+    assert main(["new", "scene", "Third", "--from", str(folder), "--rank", "2"]) == 1
+    assert main(["new", "scene", "Third", "--from", "results/ClayCat"]) == 1
+    assert "neuma next" in capsys.readouterr().err
+
+
+@core
+def test_a_chosen_camera_is_a_further_view(project, capsys):
+    chosen(project, "camera", view=4, azimuth=72, elevation=25)
+    assert main(["new", "scene", "Side", "--from", "results/JellyDuck"]) == 0
+    settings, _ = Project.find(project, ["config/Side.yaml"])
+    assert settings.identify.views == (0, 4) and settings.dataset.dynamic.views == 5
+
+
+@core
+def test_the_next_experiment_of_an_unknown_material_is_refused(project, capsys):
+    (project / "results" / "JellyDuck").mkdir(parents=True)
+    assert main(["next", "results/JellyDuck"]) == 1
+    assert "snakemake --cores 2 results/JellyDuck/identified.json" in capsys.readouterr().err
+    assert main(["next", "results/Unknown"]) == 1

@@ -8,18 +8,25 @@ from typing import Any
 
 import torch
 
+from neuma_lib.config.identify import IdentifyConfig
+from neuma_lib.coupling.initial_motion import InitialMotion
+from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.device import choose_device
 from neuma_lib.errors import InputError
 from neuma_lib.io.checkpoint import Checkpoint
-from neuma_lib.io.files import listed
+from neuma_lib.io.files import listed, read_json
+from neuma_lib.io.images import load_videos
+from neuma_lib.io.particles import load_reconstruction
 from neuma_lib.mechanics.law import Law
 from neuma_lib.methods.base import FitRun, Method, method_of
 from neuma_lib.methods.model import LawOnGrid, MotionModel
 from neuma_lib.sim.state import State
+from neuma_lib.splatting.observation import Observation
 from workflow.provenance import fingerprint
 from workflow.stage import Stage
 
-START = ("particles", "binding", "gaussians", "velocity")
+BODY = ("particles", "binding", "gaussians")
+START = (*BODY, "velocity")
 
 
 class FitStage(FitRun):
@@ -49,6 +56,24 @@ class FitStage(FitRun):
 
     def log(self, text: str) -> None:
         self._stage.log(text)
+
+
+def filmed_bodies(
+    inputs, params, settings: IdentifyConfig, device: torch.device
+) -> list[tuple[InitialMotion, Reconstruction, list[Observation]]]:
+    """Initial motion, body and videos of each of the scenes of a job."""
+    names = (*BODY, "velocity", "transforms")
+    kind: Any = dict(dtype=torch.float32, device=device)
+    return [
+        (
+            InitialMotion.of(read_json(velocity)),
+            load_reconstruction(*body, density, gaussian_motion=settings.gaussian_motion).to(**kind),
+            [video.to(**kind) for video in load_videos(transforms, settings.views, **params.exposure)],
+        )
+        for *body, velocity, transforms, density in zip(
+            *(listed(inputs[name]) for name in names), params.densities, strict=True
+        )
+    ]
 
 
 def files_of(inputs, names: Iterable[str]) -> dict[str, Any]:

@@ -97,6 +97,10 @@ class SceneConfig(Section):
         (), description="obstacles, in addition to the faces of the cube"
     )
     clamps: tuple[ClampConfig, ...] = Field((), description="regions of the body that are held or moved")
+    # Random scenes draw it. They have contact of particles then.
+    friction: float | None = internal(
+        None, "Coulomb coefficient of the faces of the cube; null: simulation.boundary", ge=0
+    )
     law: LawConfig | None = Field(description="the true material, used by the ground truth only")
     truth: TruthConfig = Field(TruthConfig(), description="resolution of the ground truth")
     dt: float = Field(gt=0, description="time step of the reconstruction, the unit of frames and steps [s]")

@@ -1,10 +1,8 @@
 """95 % bands of response curves from laws that are compatible with a video.
 
-**Constants.** An identified family has a covariance of its unbounded constants (`neuma_lib.fitting.families`). Laws are
-sampled from that normal distribution, with the error that all images share (`identify.model_std`) added. Families that
-tie with the best one get equal parts of the samples. Such a band is correct if the truth belongs to one of them. Errors
-are not normal, so a band is the central interval of the samples with the probability that `calibration.Quantiles`
-measured for its level.
+**Constants.** Laws are sampled from the covariance of the constants (`constants_draws`). Such a band is correct if the
+truth belongs to one of the families. Errors are not normal, so a band is the central interval of the samples with the
+probability that `calibration.Quantiles` measured for its level.
 
 **A structured correction** (`neuma_lib.mechanics.structured`) multiplies moduli m_a by exp(n_a(z)), with invariants z
 of the elastic strain. Deviations g_a(z) of the n_a are sampled from a Gaussian process:
@@ -38,7 +36,6 @@ from torch import Tensor
 from neuma_lib.errors import InputError
 from neuma_lib.evaluation.calibration import GRID, SHOWN, quantiles_of
 from neuma_lib.fitting.families import Family
-from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.elasticity import STRETCH_MIN
 from neuma_lib.mechanics.law import Constitutive, Law, Weights
 from neuma_lib.mechanics.singular_values import rotation_and_singular_values
@@ -52,7 +49,6 @@ from neuma_lib.mechanics.structured import (
     invariants,
     structured_law,
 )
-from neuma_lib.sim.model import MPM
 
 DRAWS = 100
 SILENT = LIMIT / 2
@@ -67,40 +63,6 @@ _DIFFERENCE = 1e-4  # step of an unbounded constant
 Output = tuple[str, int]
 """Part of a law, and index of an output of its network."""
 Band = tuple[np.ndarray, np.ndarray]
-
-
-def constants_draws(
-    identified: Mapping[str, Any],
-    model_std: float,
-    dt: float,
-    count: int,
-    seed: int,
-    *,
-    of: str = "best",
-    covariance: str = "covariance",
-    stable_in: tuple[MPM, float] | None = None,
-) -> list[Law]:
-    """Sample laws of the family in an identified.json, and of those that tie with it.
-
-    Args:
-        identified: content of the file.
-        model_std: standard deviation of every unbounded constant in addition to that from the images.
-        dt: time step [s].
-        count: approximate number of laws, divided equally among the families.
-        of: its entry with the constants, "best" or "material".
-        covariance: "covariance", or "laplace" for the Laplace approximation.
-        stable_in: simulator and density [kg/m^3] that limit the stiffness, as in the fit.
-    """
-    generator = np.random.default_rng(seed)
-    fits = [identified[of], *(identified["families"][name] for name in identified["ties"])]
-    each, laws = -(-count // len(fits)), []
-    for fit in fits:
-        family = Family("drawn", fit["law"])
-        spread = np.array(fit["unbounded"][covariance]) + model_std**2 * np.eye(len(family.constants))
-        for u in generator.multivariate_normal(fit["unbounded"]["values"], spread, each):
-            values = family.values(u, *stable_in) if stable_in else family.bounded(u)
-            laws.append(analytic_law(family.law_spec(values), dt))
-    return laws
 
 
 def corrected_draws(

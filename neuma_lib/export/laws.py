@@ -11,8 +11,7 @@ from torch import Tensor
 from neuma_lib.errors import InputError
 from neuma_lib.export.materials import EngineMaterial, check_engine, engine_law, engine_material
 from neuma_lib.export.nearest import MAX_ERROR, nearest, sampled_states
-from neuma_lib.export.scenes import write_law_scene
-from neuma_lib.io.exported import about_law
+from neuma_lib.io.exported import about_law, check_step
 from neuma_lib.io.files import existing, one_line, read_json
 from neuma_lib.io.laws import save_law
 from neuma_lib.io.mjcf import read_elasticity
@@ -22,9 +21,6 @@ from neuma_lib.mechanics.analytic import analytic_law, specification
 from neuma_lib.mechanics.catalogue import at_length_scale
 from neuma_lib.mechanics.law import Law
 from neuma_lib.mechanics.structured import StructuredLaw
-
-USD = "usd"
-"""Name of newton's materials in USD files, for programs other than newton."""
 
 
 def law_for_engine(
@@ -62,7 +58,7 @@ def law_for_engine(
     check_engine(engine)
     density = known.get("density") if density is None else density
     substep = known.get("dt") if substep is None else substep
-    spec, errors = None, None
+    errors = None
     if fit:
         spec, errors = _fitted(law, known, engine, states, force, substep)
     elif isinstance(law, AdaptableLaw):
@@ -71,25 +67,15 @@ def law_for_engine(
     else:
         spec = specification(law.elasticity, law.plasticity, law.viscosity)
     scale = known.get("scale") or 1.0
+    if scale != 1.0 and not world:
+        problem = f"a metre of its simulator is {1 / scale:.4g} m of the filmed world, which has other moduli"
+        raise InputError(f"law {law.name}", problem, "Convert it with --world, or export the scene")
     if scale != 1.0:
-        if not world:
-            problem = (
-                f"a metre of its simulator is {1 / scale:.4g} m of the filmed world, which has other moduli"
-            )
-            raise InputError(f"law {law.name}", problem, "Convert it with --world, or export the scene")
-        spec, scale = at_length_scale(spec, 1 / scale), 1.0
-    material = engine_material(spec, density, substep, engine)
-    about = {**known, "law": spec, "density": density, "substep": substep, "scale": scale, "fit": errors}
+        spec = at_length_scale(spec, 1 / scale)
+    about = {**known, "law": spec, "density": density, "substep": substep, "scale": 1.0, "fit": errors}
     if fit or world:  # other constants than those that were estimated
         about["constants"] = None
-    return material, about
-
-
-def write_engine_law(
-    path: str | Path, engine: str, material: EngineMaterial, about: Mapping[str, Any]
-) -> None:
-    """Write the material with what is known of it: .json, or a falling cube of it as .usda or .xml."""
-    write_law_scene(path, engine, material, about["density"], about["substep"], about)
+    return engine_material(spec, density, substep, engine), about
 
 
 def import_law(path: str | Path, target: str | Path, *, substep: float | None = None) -> dict[str, Any]:
@@ -104,33 +90,30 @@ def import_law(path: str | Path, target: str | Path, *, substep: float | None = 
     Raises:
         InputError: the file cannot be read, or its material has no counterpart here.
     """
-    path, density = existing(path, "Give a .json, .usda or .xml file"), None
+    path, own = existing(path, "Give a .json, .usda or .xml file"), None
     if Path(target).suffix != ".safetensors":
         raise InputError(target, "the suffix is not .safetensors", "Give the file that suffix")
     if path.suffix == ".json":
         content = read_json(path)
-        parts = (
-            [content.get(key) for key in ("engine", "class", "arguments")]
-            if isinstance(content, dict)
-            else []
-        )
-        if [isinstance(part, kind) for part, kind in zip(parts, (str, str, dict))] != [True] * 3:
+        names = {"engine": str, "class": str, "arguments": dict}
+        if not isinstance(content, dict) or not all(
+            isinstance(content.get(key), kind) for key, kind in names.items()
+        ):
             raise InputError(path, "must have the texts engine and class, and arguments by name")
-        own = content.get("substep")
-        substep = own if substep is None and isinstance(own, (int, float)) else substep
-        spec, density = engine_law(*parts, substep=substep)
-        density = content.get("density") if density is None else density
+        material, own = [content[key] for key in names], content.get("density")
+        substep = content.get("substep") if substep is None else substep
     elif path.suffix in (".usda", ".usdc", ".usd"):
-        values, density = read_material(path)
-        spec, _ = engine_law("newton", "mpm", values)
+        values, own = read_material(path)
+        material = ["newton", "mpm", values]
     elif path.suffix == ".xml":
-        spec, _ = engine_law("mujoco", "elasticity", read_elasticity(path))
+        material = ["mujoco", "elasticity", read_elasticity(path)]
     else:
-        raise InputError(
-            path, f"{one_line(path.suffix) or 'no suffix'} is not .json, .usda, .usdc, .usd or .xml"
-        )
-    law = analytic_law(spec, substep if substep else 1e-3)
-    save_law(target, law, about_law(law, substep, density=density))
+        problem = f"{one_line(path.suffix) or 'no suffix'} is not .json, .usda, .usdc, .usd or .xml"
+        raise InputError(path, problem)
+    check_step("substep", substep)
+    spec, density = engine_law(*material, substep=substep)
+    law = analytic_law(spec, substep or 1e-3)
+    save_law(target, law, about_law(law, substep, density=own if density is None else density))
     return spec
 
 
@@ -141,13 +124,12 @@ def _fitted(law: Law, known, engine: str, states: Tensor | None, force: bool, su
             problem = "does not state the states that it has visited"
             raise InputError(f"law {law.name}", problem, "Export it from the folder of its method")
         states = sampled_states(known["visited"])
-    result = nearest(law, states, engine, known.get("dt") or substep or 1e-3)
-    if result.error > MAX_ERROR and not force:
-        names = " + ".join(part["name"] for part in result.spec.values())
+    fit = nearest(law, states, engine, known.get("dt") or substep or 1e-3)
+    if fit.error > MAX_ERROR and not force:
+        names, percent = " + ".join(part["name"] for part in fit.spec.values()), 100 * fit.error
+        problem = f"the nearest law of {engine}, {names}, has a stress error of {percent:.0f} % over the visited states"
+        limit = f"more than {100 * MAX_ERROR:.0f} %"
         raise InputError(
-            f"law {law.name}",
-            f"the nearest law of {engine}, {names}, has a stress error of {100 * result.error:.0f} % over the visited "
-            f"states, more than {100 * MAX_ERROR:.0f} %",
-            "Accept it with --force, or choose another engine",
+            f"law {law.name}", f"{problem}, {limit}", "Accept it with --force, or choose another engine"
         )
-    return result.spec, result.errors
+    return fit.spec, fit.errors

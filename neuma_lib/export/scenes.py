@@ -8,7 +8,6 @@ A folder has ``scene.json`` (material, law, notes and times), ``body.npz`` (star
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import permutations
@@ -32,6 +31,10 @@ from neuma_lib.splatting.spherical_harmonics import sh0_to_rgb
 CONTACT = "Contact is no part of a law. It is that of the engine, so that rebounds differ"
 MAX_UNEVEN, MAX_SPREAD = 1e-3, 0.2
 """Largest relative difference of densities that count as one, and standard deviation of volumes over their mean."""
+SCENE_FILES = {"newton": "scene.usda", "mujoco": "scene.xml"}
+"""File of a scene that an engine loads itself. A script builds those of Genesis."""
+STICKS = 1e3
+"""Coulomb coefficient of a floor on which nothing slides."""
 SAMPLE_EDGE, SAMPLE_COUNT, SAMPLE_HEIGHT = 0.2, 16, 0.1
 """Edge [m], particles along it, and height above the floor [m] of the cube in the file of a law alone."""
 
@@ -47,7 +50,7 @@ class EngineScene:
         steps, every: number of steps, and steps from one recorded state to the next.
         grid: cells per metre.
         gravity: [m/s^2].
-        friction: Coulomb coefficient of the floor, which may be infinite.
+        friction: Coulomb coefficient of the floor.
         colors: linear colours of the particles in [0, 1], (N, 3), or None.
         notes: what of the scene is not carried over.
     """
@@ -61,7 +64,7 @@ class EngineScene:
     every: int
     grid: int
     gravity: tuple[float, float, float] = (0.0, -9.8, 0.0)
-    friction: float = math.inf
+    friction: float = STICKS
     colors: np.ndarray | None = None
     notes: tuple[str, ...] = ()
 
@@ -89,11 +92,10 @@ class EngineScene:
         if C.any():
             notes.append("affine velocities of particles start at zero, which slows a spin in the first step")
         wall = mpm.boundary[2]
-        friction = {"no_slip": math.inf, "sticky": math.inf, "slip": 0.0}.get(wall, wall)
+        friction = min({"no_slip": STICKS, "sticky": STICKS, "slip": 0.0}.get(wall, wall), STICKS)
         colors = None if gaussians is None else _colors(x, gaussians)
-        return cls(
-            x, v, mass, vol0, mpm.dt, steps, every, mpm.grid, mpm.gravity, float(friction), colors, tuple(notes)
-        )  # fmt: skip
+        own = (mpm.dt, steps, every, mpm.grid, mpm.gravity, float(friction))
+        return cls(x, v, mass, vol0, *own, colors, tuple(notes))
 
     @classmethod
     def falling_cube(cls, density: float, dt: float, seconds: float = 0.5) -> EngineScene:
@@ -101,12 +103,9 @@ class EngineScene:
         spacing = SAMPLE_EDGE / SAMPLE_COUNT
         sites = np.indices((SAMPLE_COUNT,) * 3).reshape(3, -1).T - (SAMPLE_COUNT - 1) / 2
         x = sites * spacing + [0.5, SAMPLE_HEIGHT + SAMPLE_EDGE / 2, 0.5]
-        vol0 = np.full(len(x), spacing**3)
-        steps = round(seconds / dt)
-        every = max(1, round(5e-3 / dt))
-        return cls(
-            x, np.zeros_like(x), density * vol0, vol0, dt, steps, every, round(0.5 / spacing), friction=0.0
-        )
+        vol0, steps, every = np.full(len(x), spacing**3), round(seconds / dt), max(1, round(5e-3 / dt))
+        own = (dt, steps, every, round(0.5 / spacing))
+        return cls(x, np.zeros_like(x), density * vol0, vol0, *own, friction=0.0)
 
     @property
     def density(self) -> float:
@@ -119,28 +118,27 @@ class EngineScene:
 
 
 def write_law_scene(
-    path: str | Path,
-    engine: str,
-    material: EngineMaterial,
-    density: float,
-    dt: float,
-    about: Mapping[str, Any],
+    path: str | Path, engine: str, material: EngineMaterial, about: Mapping[str, Any]
 ) -> None:
     """Write a file that the engine loads: ``.usda`` or ``.xml`` of a falling cube, or ``.json`` of the material alone.
+
+    Args:
+        about: as of `neuma_lib.export.laws.law_for_engine`.
 
     Raises:
         InputError: a suffix that the engine does not read.
     """
-    content = _about(engine, material, about)
-    suffix, wanted = Path(path).suffix, {"genesis": (), "newton": (".usda",), "mujoco": (".xml",)}[engine]
-    if suffix == ".json":
+    content, own = _about(engine, material, about), Path(SCENE_FILES.get(engine, ".json")).suffix
+    if Path(path).suffix == ".json":
         write_json(path, content)
-    elif suffix in wanted:
-        write_text(path, _text(engine, EngineScene.falling_cube(density, dt), material, content))
-    else:
-        raise InputError(
-            path, f"{engine} reads {' or '.join(('.json', *wanted))}", "Give the file that suffix"
+    elif Path(path).suffix == own:
+        write_text(
+            path,
+            _text(engine, EngineScene.falling_cube(about["density"], about["substep"]), material, content),
         )
+    else:
+        wanted = " or ".join(dict.fromkeys((".json", own)))
+        raise InputError(path, f"{engine} reads {wanted}", "Give the file that suffix")
 
 
 def export_scene(
@@ -172,17 +170,12 @@ def export_scene(
         notes += (f"all particles get the mean volume, from which theirs differ by {100 * spread:.0f} %",)
     content = _about(engine, material._replace(notes=notes), {**about, "law": spec, "density": scene.density})
     times = {name: getattr(scene, name) for name in ("dt", "steps", "every", "grid", "gravity")}
-    # JSON has no infinity
-    floor = {"friction": scene.friction if math.isfinite(scene.friction) else "sticks"}
     body = {name: getattr(scene, name) for name in ("x", "v", "mass", "vol0")}
-    if engine == "genesis":
-        body["size"] = np.array(float(scene.vol0.mean()) ** (1 / 3))
-    else:
-        name = {"newton": "scene.usda", "mujoco": "scene.xml"}[engine]
-        write_text(folder / name, _text(engine, scene, material._replace(notes=notes), content))
+    if engine in SCENE_FILES:
+        write_text(folder / SCENE_FILES[engine], _text(engine, scene, material, content))
     if engine == "mujoco":
         body["v"] = _mesh(scene)[3]
-    write_json(folder / "scene.json", {**content, **times, "floor": floor})
+    write_json(folder / "scene.json", {**content, **times, "floor": {"friction": scene.friction}})
     with atomic(folder / "body.npz") as partial, partial.open("wb") as file:
         np.savez(file, **body)
     script = Path(__file__).with_name("players") / f"{engine}.py"
@@ -192,10 +185,8 @@ def export_scene(
 
 def _about(engine: str, material: EngineMaterial, about: Mapping[str, Any]) -> dict[str, Any]:
     grid = about.get("grid")
-    constants = (
-        "of the material" if grid is None else f"fitted on a grid of {grid} cells, whose error they contain"
-    )
-    notes = [*material.notes, f"constants {constants}", CONTACT]
+    fitted = f"fitted on a grid of {grid} cells, whose error they contain"
+    notes = [*material.notes, f"constants {'of the material' if grid is None else fitted}", CONTACT]
     keys = ("law", "constants", "density", "scale", "substep", "fit", "scene", "method", "commit")
     return {
         "engine": engine,
@@ -208,25 +199,16 @@ def _about(engine: str, material: EngineMaterial, about: Mapping[str, Any]) -> d
 
 
 def _text(engine: str, scene: EngineScene, material: EngineMaterial, about: Mapping[str, Any]) -> str:
+    """Text of the file that an engine loads, `SCENE_FILES`."""
     shared = dict(gravity=scene.gravity, friction=scene.friction)
     if engine == "newton":
-        widths = scene.vol0 ** (1 / 3)
-        return particle_scene(
-            scene.x, scene.v, scene.mass, widths, scene.colors, material.arguments,
-            density=scene.density, cell=1 / scene.grid, about=about, **shared,
-        )  # fmt: skip
+        body = (scene.x, scene.v, scene.mass, scene.vol0 ** (1 / 3), scene.colors)
+        more = dict(density=scene.density, cell=1 / scene.grid, about=about, **shared)
+        return particle_scene(*body, material.arguments, **more)
     vertices, tetrahedra, masses, _, cell = _mesh(scene)
     words = {key: json.dumps(value) for key, value in about.items() if value is not None}
-    return flex_scene(
-        vertices,
-        tetrahedra,
-        masses,
-        material.arguments,
-        radius=0.02 * cell,
-        dt=scene.dt,
-        about=words,
-        **shared,
-    )
+    more = dict(radius=0.02 * cell, dt=scene.dt, about=words, **shared)
+    return flex_scene(vertices, tetrahedra, masses, material.arguments, **more)
 
 
 def _mesh(scene: EngineScene) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:

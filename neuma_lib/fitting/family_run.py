@@ -15,6 +15,7 @@ from torch import Tensor
 
 from neuma_lib.config.identify import IdentifyConfig
 from neuma_lib.coupling.initial_motion import InitialMotion
+from neuma_lib.errors import NonFiniteError
 from neuma_lib.fitting.families import FRICTION, Family
 from neuma_lib.fitting.identified import FamilyFit
 from neuma_lib.fitting.least_squares import (
@@ -184,6 +185,37 @@ class FamilyRun:
         """Compute the derivatives of the residuals of all videos by the deviations at this fit."""
         for v, video in enumerate(self.videos):
             video.differentiate(self._candidate(self._u, v))
+
+    def linearise_at(self, values: Values) -> Linearisation:
+        """The problem at the last level, linearised at constants and the estimated motions without a fit.
+
+        Raises:
+            NonFiniteError: the rollout diverges.
+        """
+        self._origin, self._level = self.family.unbounded(values), len(self.settings.pyramid) - 1
+        if not math.isfinite(self.cost(self._u)):
+            raise NonFiniteError(self.family.name, "the simulation with the identified constants diverges")
+        if any(video.by_deviation is None for video in self.videos):
+            self.differentiate()
+        return self.linearise(self._u, self._free)
+
+    def imitate(self, values: Values, noise: float) -> None:
+        """Fit at the last level from constants, with a known variance of the residuals per unit of curvature.
+
+        Raises:
+            NonFiniteError: the rollout diverges.
+        """
+        self.linearise_at(values)
+        P = np.diag(noise / self._spreads**2)
+        self._u, self.fit, _ = levenberg_marquardt(
+            self,
+            self._u,
+            self._free,
+            lambda fit: P,
+            self.settings.min_gain,
+            self.settings.iterations,
+            longest=self.settings.longest_step,
+        )
 
     def score(self) -> FamilyFit:
         """The result of the fit, evaluated on the held-out frames if any."""

@@ -150,6 +150,14 @@ class VideoResiduals:
             for each, filmed, size in zip(observed, self._coarse.films, self._finest, strict=True)
         ]  # fmt: skip
 
+    def observe(self, candidate: Candidate) -> bool:
+        """Replace the observed images by those of a candidate. Returns False if its rollout diverges."""
+        (residual,) = self.residuals([candidate], len(self.frames))
+        if residual is not None:
+            pairs = zip(residual, self._observed, strict=True)
+            self._observed = [own / self.weight + images for own, images in pairs]
+        return residual is not None
+
     def set_friction(self, friction: float) -> None:
         """Set the Coulomb coefficient of all obstacles in the simulations that follow."""
         self.model = self.model.with_friction(friction)

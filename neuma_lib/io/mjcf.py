@@ -13,8 +13,8 @@ import numpy as np
 from neuma_lib.errors import InputError
 from neuma_lib.io.files import existing, one_line, reading
 
-STICKS = 1e3
-"""Coulomb coefficient that stands for infinity."""
+MAX_BYTES = 1 << 28
+"""Size of a file that is read."""
 
 
 def flex_scene(
@@ -41,11 +41,9 @@ def flex_scene(
         radius: distance from a vertex at which contact starts [m].
         dt: time step [s].
         gravity: [m/s^2].
-        friction: Coulomb coefficient of the floor, which may be infinite. With pyramidal cones, bodies fall through a
-            floor of a coefficient above 2.
+        friction: Coulomb coefficient of the floor.
         about: texts of a comment by name.
     """
-    friction = min(friction, STICKS)
     comment = "\n".join(f"  {key}: {value}" for key, value in about.items()).replace("--", "- -")
     slides = "".join(f'<joint type="slide" axis="{axis}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1"))
     bodies = "\n".join(
@@ -53,6 +51,7 @@ def flex_scene(
         f'diaginertia="{_numbers([1e-3 * m * radius**2] * 3)}"/>{slides}</body>'
         for k, (x, m) in enumerate(zip(vertices, masses, strict=True))
     )
+    # cone="elliptic": with pyramids, bodies fall through a floor of a coefficient above 2
     return f"""<mujoco model="neuma">
   <!--
 {comment}
@@ -102,9 +101,6 @@ def read_elasticity(path: str | Path) -> dict[str, Any]:
     except ValueError:
         raise InputError(path, f"its elasticity {one_line(values)} must have numbers only") from None
     return numbers
-
-
-MAX_BYTES = 1 << 28
 
 
 def _numbers(values: Sequence[float] | np.ndarray) -> str:

@@ -31,8 +31,6 @@ ATTRIBUTES = {
     "dilatancy": "dilatancy",
 }
 """Names of the schema, after ``newton:mpm:``, of newton's particle attributes ``mpm:``."""
-STICKS = 1e3
-"""Coulomb coefficient that stands for infinity."""
 
 
 def particle_scene(
@@ -56,17 +54,16 @@ def particle_scene(
         masses: of the particles [kg], (N,).
         widths: edges of the cubes of the particles [m], (N,), whose volumes newton takes as widths^3.
         colors: linear colours in [0, 1], (N, 3), or None.
-        material: newton's attributes by name, without ``mpm:`` (`ATTRIBUTES`). ``damping`` is in seconds.
+        material: newton's attributes by name, without ``mpm:`` (`ATTRIBUTES`).
         density: of the material [kg/m^3].
         cell: of the background grid [m].
         gravity: [m/s^2].
-        friction: Coulomb coefficient of the floor, which may be infinite.
+        friction: Coulomb coefficient of the floor.
         about: plain values that are kept in the metadata of the file.
     """
     strength = math.hypot(*gravity)
     down = [float(g) / strength for g in gravity] if strength else [0.0, -1.0, 0.0]
-    values = {**material, "damping": material.get("damping", 0.0) * material.get("young_modulus", 0.0)}
-    attributes = "\n".join(f"        float newton:mpm:{ATTRIBUTES[k]} = {v:.9g}" for k, v in values.items())
+    attributes = "\n".join(f"        float newton:mpm:{ATTRIBUTES[k]} = {v:.9g}" for k, v in material.items())
     ends = f"[{_vector(x.min(axis=0) - widths.max() / 2)}, {_vector(x.max(axis=0) + widths.max() / 2)}]"
     display = "" if colors is None else (
         f'\n        color3f[] primvars:displayColor = {_vectors(colors)} (interpolation = "vertex")'
@@ -107,8 +104,8 @@ def Xform "scene"
         prepend apiSchemas = ["PhysicsMaterialAPI"]
     )
     {{
-        float physics:dynamicFriction = {min(friction, STICKS):.9g}
-        float physics:staticFriction = {min(friction, STICKS):.9g}
+        float physics:dynamicFriction = {friction:.9g}
+        float physics:staticFriction = {friction:.9g}
     }}
 
     def Plane "floor" (
@@ -163,16 +160,12 @@ def read_material(path: str | Path) -> tuple[dict[str, float], float | None]:
         return float(value) if isinstance(value, (int, float)) and math.isfinite(value) else None
 
     pascal = kilogram / metre
-    units = {
-        name: pascal for name in ("young_modulus", "damping", "yield_pressure", "yield_stress", "viscosity")
-    }
+    units = dict.fromkeys(("young_modulus", "damping", "yield_pressure", "yield_stress", "viscosity"), pascal)
     values = {
         name: value * units.get(name, 1.0)
         for name, token in ATTRIBUTES.items()
         if (value := authored(f"newton:mpm:{token}")) is not None
     }
-    if "damping" in values:
-        values["damping"] /= values.get("young_modulus", 1e15)
     density = authored("physics:density")
     return values, density * kilogram / metre**3 if density else None
 

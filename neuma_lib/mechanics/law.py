@@ -254,13 +254,18 @@ class Law(nn.Module):
 
     def tangent(self, F: Tensor) -> Tensor:
         """Consistent tangent dP_ij / dF_kl [Pa], (N, 3, 3, 3, 3), of `first_piola`. Detached."""
-        with torch.enable_grad():
-            F = F.detach().requires_grad_()
-            components = self.first_piola(F).sum(dim=0).flatten()
-            if not components.requires_grad:
-                return F.new_zeros(len(F), 3, 3, 3, 3)
-            rows = [torch.autograd.grad(component, F, retain_graph=True)[0] for component in components]
-        return torch.stack(rows, dim=1).unflatten(1, (3, 3))
+        F = F.detach()
+        elastic, plastic = (tuple(w.detach().to(F) for w in own) for own in self.weights())
+        E, plastic_cache = self.plasticity.evaluate_with_cache(F, plastic)
+        tau, cache = self.elasticity.evaluate_with_cache(E, elastic)
+        slopes = []
+        for unit in torch.eye(9, dtype=F.dtype, device=F.device).reshape(9, 1, 3, 3):
+            grad = self.elasticity.vjp(E, elastic, unit.expand_as(F).contiguous(), cache)[0]
+            slopes.append(self.plasticity.vjp(F, plastic, grad, plastic_cache)[0])
+        by_F = torch.stack(slopes, dim=1).unflatten(1, (3, 3))  # d tau_ij / dF_kl
+        inverse = torch.linalg.inv(F)
+        P = tau @ inverse.mT
+        return torch.einsum("nimkl,njm->nijkl", by_F, inverse) - torch.einsum("nil,njk->nijkl", P, inverse)
 
     def weights(self) -> tuple[Weights, Weights]:
         """Weights of the elasticity and of the plasticity."""

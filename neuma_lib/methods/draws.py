@@ -8,7 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuma_lib.evaluation.bands import constants_draws, corrected_draws
+from neuma_lib.evaluation.bands import corrected_draws
+from neuma_lib.evaluation.constants_draws import constants_draws
 from neuma_lib.io.files import read_json
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.mechanics.law import Law

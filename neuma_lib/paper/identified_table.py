@@ -48,12 +48,18 @@ def compare_family(identified: Mapping[str, Any], truth: Mapping[str, Mapping[st
         identified: content of identified.json.
         truth: specification of the true law.
     """
-    true = _kind(truth)
-    if _kind(identified["law"]) == true:
+    if _kind(identified["law"]) == _kind(truth):
         return RIGHT
-    return (
-        TIE if true in (_kind(identified["families"][name]["law"]) for name in identified["ties"]) else WRONG
-    )
+    return TIE if right_families(identified, truth) & {*identified["ties"]} else WRONG
+
+
+def right_families(identified: Mapping[str, Any], truth: Mapping[str, Mapping[str, Any]]) -> set[str]:
+    """Names of the candidates of the family of the true law.
+
+    Args:
+        identified, truth: as of `compare_family`.
+    """
+    return {name for name, fit in identified["families"].items() if _kind(fit["law"]) == _kind(truth)}
 
 
 def compare_quantities(

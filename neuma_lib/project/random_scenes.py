@@ -17,6 +17,7 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, PositiveFloat, model_validator
 
 from neuma_lib.config.base import Section, Seed, Vector, internal, no_boolean
+from neuma_lib.config.dataset import CONVERGED
 from neuma_lib.config.laws import LawConfig
 from neuma_lib.errors import InputError
 
@@ -145,6 +146,14 @@ class RandomConfig(Section):
     shapes: tuple[Literal[tuple(SHAPES)], ...] = internal(
         tuple(SHAPES), "shapes, which consecutive scenes take in turn", min_length=1
     )
+    converged: float = internal(
+        0.0, "share of the scenes with a converged truth; the others have that of `dataset`", ge=0, le=1
+    )
+    # Sampled log-uniformly.
+    friction: PositiveRange | None = internal(
+        None,
+        "minimum and maximum of the Coulomb coefficient of the faces of the cube; null: simulation.boundary",
+    )
     # No other table may contain scenes of a seed for development, and results/random.csv of it has no verdicts.
     development_seeds: tuple[Seed, ...] = internal(
         (1, 2, 3, 4), "seeds on whose scenes methods are developed"
@@ -237,6 +246,7 @@ def draw_scenes(
             problem = f"{ATTEMPTS} draws of a {shape} of the family {family} are unusable: {counted}"
             raise InputError("random", problem, "Change the ranges")
         scene |= {"dt": dt, "steps": STEPS * max(1, round(scene.pop("duration") / dt / STEPS))}
+        scene |= _contact_and_truth(settings, k)
         scene["appearance"] = _appearance(settings, k, shape, family)
         scenes[f"{settings.prefix}{k:02d}_{shape}_{family}"] = scene
     return scenes
@@ -274,6 +284,21 @@ def _drawn(
         "prior": family.prior,
         "story": f"drawn at random with seed {settings.seed}",
     }
+
+
+def _contact_and_truth(settings: RandomConfig, k: int) -> dict[str, Any]:
+    """Friction of a scene and resolution of its truth, if they are not those of all scenes.
+
+    Converged truths are evenly distributed: of the first n scenes, round(n * share) have one.
+    """
+    chosen: dict[str, Any] = {}
+    if round((k + 1) * settings.converged) > round(k * settings.converged):
+        chosen["truth"] = CONVERGED
+    if settings.friction:
+        low, high = settings.friction
+        draw = np.random.default_rng([settings.seed, 4, k]).random()
+        chosen["friction"] = _rounded(low * (high / low) ** draw)
+    return chosen
 
 
 def _direction(rng: np.random.Generator) -> list[float]:

@@ -7,8 +7,11 @@ import re
 import shutil
 from pathlib import Path
 
+import yaml
+
 from neuma_lib.config.variants import name_problem
 from neuma_lib.errors import InputError
+from neuma_lib.io.files import read_json
 from neuma_lib.project.capture_scenes import scene_name
 from neuma_lib.project.settings import Config
 
@@ -87,14 +90,7 @@ def new_scene(root: Path, name: str, settings: Config, mesh: str | Path | None =
     Raises:
         InputError: a name that cannot be used, or that exists; a mesh that cannot be read.
     """
-    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
-        raise InputError(
-            name, "a scene's name must consist of letters, digits and _, and begin with a letter"
-        )
-    if problem := name_problem(name):
-        raise InputError(name, problem)
-    if name in settings.scenes or name in settings.experiments:
-        raise InputError(name, "a scene or experiment of this name exists", "Choose another name")
+    _check_name(name, settings)
     target = root / "config" / f"{name}.yaml"
     if mesh is None:
         return _written(target, SCENE.format(name=name, **BUILT_IN))
@@ -112,6 +108,47 @@ def new_scene(root: Path, name: str, settings: Config, mesh: str | Path | None =
     return _written(target, SCENE.format(name=name, **{**OWN_MESH, "shape": shape}))
 
 
+def next_scene(root: Path, name: str, settings: Config, folder: Path, rank: int = 1) -> Path:
+    """Write config/<name>.yaml with an experiment that the page of the next experiment lists.
+
+    A launch becomes the scene <name>, whose video trains the same law as that of the existing scene. A second camera
+    changes the views of the existing scene.
+
+    Args:
+        root: folder of the project.
+        folder: results of the scene, with next.json.
+        rank: of the experiment, from 1.
+
+    Raises:
+        InputError: there is no such experiment, the scene is not rendered, or a name that cannot be used.
+    """
+    known = folder.name
+    if not (folder / "next.json").is_file():
+        problem = "does not exist, so no experiment has been chosen"
+        raise InputError(folder / "next.json", problem, f"Run `neuma next {folder}` first")
+    _check_name(name, settings)
+    candidates = read_json(folder / "next.json")["candidates"]
+    if not 1 <= rank <= len(candidates):
+        raise InputError("--rank", f"{rank} must be from 1 to {len(candidates)}")
+    scene, chosen = settings.scene(known), candidates[rank - 1]
+    if not scene.has_truth or scene.images.dynamic is not None:
+        problem = "is not rendered, so that the experiment has to be done and filmed"
+        raise InputError(known, problem, "Add its video to the capture, or as a scene to `videos`")
+    if chosen["kind"] == "camera":
+        view = chosen["settings"]["view"]
+        views = sorted({*settings.identify.views, view})
+        count = max(settings.dataset.dynamic.views, view + 1)
+        content = {"identify": {"views": views}, "dataset": {"dynamic": {"views": count}}}
+    else:
+        launch = {"like": known, **chosen["settings"], "frames": None}
+        content = {"scenes": {name: launch, known: {"videos": [*scene.videos, name]}}}
+    title = f"# Experiment {rank} of {folder.name}/next.md, on top of the settings of {known}.\n"
+    return _written(
+        root / "config" / f"{name}.yaml",
+        f"# yaml-language-server: $schema=schema.json\n{title}{yaml.safe_dump(content, sort_keys=False)}",
+    )
+
+
 def new_capture(root: Path, name: str, settings: Config) -> Path:
     """Write captures/<name>/capture.yaml and create the folders of its files.
 
@@ -127,6 +164,18 @@ def new_capture(root: Path, name: str, settings: Config) -> Path:
     for kind in ("photos", "stills", "videos"):
         (folder / kind).mkdir(exist_ok=True)
     return path
+
+
+def _check_name(name: str, settings: Config) -> None:
+    """Raises InputError if a name cannot be that of a new scene."""
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
+        raise InputError(
+            name, "a scene's name must consist of letters, digits and _, and begin with a letter"
+        )
+    if problem := name_problem(name):
+        raise InputError(name, problem)
+    if name in settings.scenes or name in settings.experiments:
+        raise InputError(name, "a scene or experiment of this name exists", "Choose another name")
 
 
 def _written(path: Path, text: str) -> Path:

@@ -22,6 +22,7 @@ from neuma_lib.config.figures import FiguresConfig
 from neuma_lib.config.gaussians import GaussiansConfig
 from neuma_lib.config.geometry import GeometryConfig
 from neuma_lib.config.identify import IdentifyConfig
+from neuma_lib.config.next import NextConfig
 from neuma_lib.config.obstacles import ColliderConfig
 from neuma_lib.config.photographs import PhotographsConfig
 from neuma_lib.config.priors import PriorsConfig
@@ -72,6 +73,7 @@ class Config(Section):
     binding: BindingConfig = Field(BindingConfig(), description="Gaussians to particles")
     velocity: VelocityConfig = Field(VelocityConfig(), description="initial velocity")
     identify: IdentifyConfig = Field(IdentifyConfig(), description="family and constants of the material")
+    next: NextConfig = Field(NextConfig(), description="choice of the next experiment")
     training: TrainingConfig = Field(TrainingConfig(), description="adaptation of the law")
     structured: StructuredConfig = Field(
         StructuredConfig(), description="laws with the structure of a material"
@@ -157,12 +159,17 @@ class Config(Section):
         return {"grid": captured.grid or self.captures.grid, "gravity": gravity}
 
     def obstacles(self, name: str) -> dict[str, Any]:
-        """Plain arguments of `neuma_lib.io.simulator.simulator` of a scene or an experiment with obstacles."""
+        """Plain arguments of `neuma_lib.io.simulator.simulator` of a scene or an experiment with obstacles or friction.
+
+        The faces of the cube have the friction of the scene, in an experiment of the first body's.
+        """
         base, _ = self.replicate(name)
-        of = self.experiments.get(base) or self.scenes[base]
-        lists = {"colliders": self.colliders(name)[1], "clamps": of.clamps}
+        experiment = self.experiments.get(base)
+        lists = {"colliders": self.colliders(name)[1], "clamps": (experiment or self.scenes[base]).clamps}
         plain = {key: [each.arguments() for each in entries] for key, entries in lists.items() if entries}
-        return plain | ({"contact": "particles"} if "colliders" in plain else {})
+        friction = self.scenes[experiment.bodies[0].scene if experiment else base].friction
+        plain |= {} if friction is None else {"boundary": friction}
+        return plain | ({"contact": "particles"} if plain.keys() & {"colliders", "boundary"} else {})
 
     def colliders(self, name: str) -> tuple[str, tuple[ColliderConfig, ...]]:
         """Path of the key with the colliders of a scene or an experiment, and them."""

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import torch
 import warp as wp
 
+from neuma_lib.sim.body_contact import body_functions
 from neuma_lib.sim.clamp_kernels import clamp_functions, hold_type
 from neuma_lib.sim.contact_kernels import contact_functions, obstacle_type
 from neuma_lib.sim.gather import gather_functions
@@ -20,10 +21,11 @@ from neuma_lib.sim.scatter import scatter_functions
 
 
 @functools.cache
-def adjoint_functions(dtype: torch.dtype, clamps: bool) -> SimpleNamespace:
+def adjoint_functions(dtype: torch.dtype, clamps: bool, bodies: bool) -> SimpleNamespace:
     """Adjoints of `kernels.forward_functions`."""
     t, wall_mask = warp_types(dtype), grid_functions(dtype).wall_mask
     real, vec3, vec4, mat33, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.GridConstants
+    mass_gradient = body_functions(dtype, GridConstants).mass_gradient if bodies else None
 
     @wp.func
     def deformation_adjoint(c: GridConstants, C_after: mat33, grad_F_trial: mat33):
@@ -32,15 +34,28 @@ def adjoint_functions(dtype: torch.dtype, clamps: bool) -> SimpleNamespace:
 
     @wp.func
     def node_adjoint(
-        c: GridConstants, node: wp.int32, grid: wp.array(dtype=vec4), grad_grid: wp.array(dtype=vec4)
+        c: GridConstants,
+        node: wp.int32,
+        grid: wp.array(dtype=vec4),
+        grad_grid: wp.array(dtype=vec4),
+        grad_before: wp.array(dtype=vec4),
+        grad_around: wp.array(dtype=vec4),
     ):
-        """In place: from the gradient of a node's velocity to those of its momentum and mass."""
+        """In place: from the gradient of a node's velocity to those of its momentum and mass.
+
+        With several bodies the gradient of the velocity before contact is in ``grad_before`` (`body_contact`).
+        """
         mv = grid[node]
         if mv[3] > real(0.0):
             v = vec3(mv[0], mv[1], mv[2]) / mv[3]
             g = grad_grid[node]
+            if wp.static(bodies):
+                g = grad_before[node]
             g_mv = wp.cw_mul(vec3(g[0], g[1], g[2]), wall_mask(c, node, v + c.dt * c.gravity)) / mv[3]
-            grad_grid[node] = vec4(g_mv[0], g_mv[1], g_mv[2], -wp.dot(g_mv, v))
+            g_m = -wp.dot(g_mv, v)
+            if wp.static(bodies):
+                g_m += mass_gradient(c, node, grad_before, grad_around)
+            grad_grid[node] = vec4(g_mv[0], g_mv[1], g_mv[2], g_m)
         if wp.static(clamps):
             if mv[3] < real(0.0):  # a held node
                 grad_grid[node] = vec4()
@@ -52,8 +67,11 @@ def adjoint_functions(dtype: torch.dtype, clamps: bool) -> SimpleNamespace:
 def adjoint_kernels(
     dtype: torch.dtype, scatter: str = "atomic", features: tuple[str, ...] = ()
 ) -> SimpleNamespace:
-    """Kernels `g2p_adjoint`, `grid_adjoint` and `p2g_adjoint`, see `kernels.forward_kernels`."""
-    contact, clamps = "contact" in features, "clamps" in features
+    """Kernels `g2p_adjoint`, `grid_adjoint` and `p2g_adjoint`, and `body_contact_adjoint` if there are several bodies.
+
+    See `kernels.forward_kernels`.
+    """
+    contact, clamps, bodies = "contact" in features, "clamps" in features, "bodies" in features
     Hold, held, _ = hold_type(dtype), *vars(clamp_functions(dtype)).values()
     t, functions = warp_types(dtype), grid_functions(dtype)
     Obstacle, touching = obstacle_type(dtype), contact_functions(dtype, features)
@@ -63,7 +81,7 @@ def adjoint_kernels(
     real, vec3, vec4, mat33, mat34, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.mat34, t.GridConstants
     stencil, slopes, moments = functions.stencil, functions.slopes, functions.moments
     column, moved_mask, obstacle_row = functions.column, functions.moved_mask, functions.obstacle_row
-    deformation_adjoint, node_adjoint = vars(adjoint_functions(dtype, clamps)).values()
+    deformation_adjoint, node_adjoint = vars(adjoint_functions(dtype, clamps, bodies)).values()
     gather, three_nodes = gather_functions(dtype)
     module = f"neuma_lib.sim.adjoint_{str(dtype).removeprefix('torch.')}_{'_'.join((scatter, *features))}"
     kernel = functools.partial(wp.kernel, enable_backward=False, module=module)
@@ -140,13 +158,15 @@ def adjoint_kernels(
         side: wp.int32,
         grid: wp.array2d(dtype=vec4),
         grad_grid: wp.array2d(dtype=vec4),
+        grad_before: wp.array(dtype=vec4),
+        grad_around: wp.array(dtype=vec4),
     ):
         """Gradients of the nodes in place (`adjoint_functions`).
 
         Clears the other side of `grad_grid` for the previous step.
         """
         node = wp.tid()
-        node_adjoint(c, node, grid[cached], grad_grid[side])
+        node_adjoint(c, node, grid[cached], grad_grid[side], grad_before, grad_around)
         grad_grid[1 - side, node] = vec4()
 
     @kernel
@@ -239,8 +259,26 @@ def adjoint_kernels(
         grad_tau[p] = -stress * g_A
         grad_x[p] = grad_x[p] + c.inv_dx * (moving - wp.transpose(A) * g)
 
+    body_contact_adjoint = None
+    if bodies:
+        contact_adjoint = body_functions(dtype, GridConstants).adjoint
+
+        @kernel
+        def body_contact_adjoint(
+            c: GridConstants,
+            cached: wp.int32,
+            side: wp.int32,
+            grid: wp.array2d(dtype=vec4),
+            grad_grid: wp.array2d(dtype=vec4),
+            pairs: wp.array2d(dtype=real),
+            grad_before: wp.array(dtype=vec4),
+            grad_around: wp.array(dtype=vec4),
+        ):
+            contact_adjoint(c, pairs, grid[cached], grad_grid[side], wp.tid(), grad_before, grad_around)
+
     return SimpleNamespace(
         g2p_adjoint=g2p_adjoint,
+        body_contact_adjoint=body_contact_adjoint,
         grid_adjoint=grid_adjoint,
         p2g_adjoint=p2g_adjoint,
     )

@@ -12,7 +12,7 @@ from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.mechanics.law import Law
 from neuma_lib.mechanics.side_by_side import fusible, has_kernels, side_by_side
 from neuma_lib.sim.model import MPM, MaterialRegion
-from neuma_lib.sim.rollout import check_inside, checked_frames, fly_and_simulate
+from neuma_lib.sim.rollout import check_bodies, check_inside, checked_frames, fly_and_simulate
 from neuma_lib.sim.state import State, Trajectory
 from neuma_lib.threads import in_threads
 
@@ -56,7 +56,8 @@ def rollout_batch(
     """
     frames = checked_frames(frames, steps)
     starts = [start] * len(laws) if isinstance(start, State) else list(start)
-    if not laws or len(starts) != len(laws) or len({len(state.x) for state in starts}) > 1:
+    alike = len({(len(state.x), state.bodies) for state in starts}) == 1
+    if not laws or len(starts) != len(laws) or not alike:
         raise InputError(
             "laws",
             f"{len(laws)} laws do not match initial states of {[len(state.x) for state in starts]} particles",
@@ -71,6 +72,7 @@ def rollout_batch(
             "Give one for all",
         )
     for state in {id(state): state for state in starts}.values():
+        check_bodies(model, state)
         check_inside(model, state.x)
     order = sorted(range(len(laws)), key=lambda copy: not fusible(laws[copy]))
     device, dtype = starts[0].x.device, starts[0].x.dtype
@@ -113,7 +115,16 @@ def _side_by_side(
     state = State.joined(starts) if copies > 1 else starts[0]
     try:
         path, errors = fly_and_simulate(
-            model, tuple(regions), state, frames, None, total, skip_free_flight, copies, frictions=frictions
+            model,
+            tuple(regions),
+            state,
+            frames,
+            None,
+            total,
+            skip_free_flight,
+            copies,
+            frictions=frictions,
+            bodies=starts[0].bodies,
         )
     except NonFiniteError as error:
         if copies > 1 and error.step is None:  # from the code of a law, which does not state the copy

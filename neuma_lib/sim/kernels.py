@@ -14,7 +14,7 @@ Order: for scatter methods that profit from neighbouring particles in a warp (`s
 ``order[sort, i]``, from a sort by cell a few steps ago. Gathers are faster in the order of memory.
 
 Copies: several independent simulations with equal numbers of particles are stored one after the other in the arrays
-of particles and of nodes.
+of particles and of nodes. Each body of a copy has its own nodes (`body_contact`).
 """
 
 # No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
@@ -25,6 +25,8 @@ import torch
 import warp as wp
 
 from neuma_lib.device import start_warp
+from neuma_lib.sim.bodies import MAX_RANGES
+from neuma_lib.sim.body_contact import body_functions
 from neuma_lib.sim.clamp_kernels import clamp_functions, hold_type
 from neuma_lib.sim.clamps import HELD_SHARE
 from neuma_lib.sim.contact_kernels import contact_functions, obstacle_type
@@ -54,6 +56,8 @@ def warp_types(dtype: torch.dtype) -> SimpleNamespace:
         mat33=wp.types.matrix(shape=(3, 3), dtype=real),
         mat34=wp.types.matrix(shape=(3, 4), dtype=real),
         walls=wp.types.vector(length=6, dtype=wp.int32),
+        starts=wp.types.vector(length=MAX_RANGES + 1, dtype=wp.int32),
+        body_of=wp.types.vector(length=MAX_RANGES, dtype=wp.int32),
     )
 
     @wp.struct
@@ -61,6 +65,11 @@ def warp_types(dtype: torch.dtype) -> SimpleNamespace:
         n: wp.int32  # nodes along an edge
         particles: wp.int32  # per copy
         copies: wp.int32
+        bodies: wp.int32  # per copy
+        fields: wp.int32  # grids, one of each body of each copy
+        ranges: wp.int32  # of particles of a copy that belong to one body
+        starts: types.starts  # first particle of each range in its copy, and the end of the last
+        body_of: types.body_of  # body of each range
         wall_nodes: wp.int32  # thickness of a wall
         faces: wp.int32  # first obstacles that are faces of the unit cube
         walls: types.walls  # condition on x_min, x_max, y_min, y_max, z_min, z_max
@@ -98,6 +107,20 @@ def grid_functions(dtype: torch.dtype) -> SimpleNamespace:
         return copy
 
     @wp.func
+    def field_of(c: GridConstants, p: wp.int32):
+        """Grid of particle p."""
+        field = copy_of(c, p)
+        if c.bodies > 1:
+            q = p - field * c.particles
+            field = field * c.bodies
+            own = wp.int32(0)
+            for k in range(1, c.ranges):
+                if q >= c.starts[k]:
+                    own = k
+            field += c.body_of[own]
+        return field
+
+    @wp.func
     def obstacle_row(c: GridConstants, p: wp.int32, pose: wp.int32):
         """Row of the obstacles of particle p, which copies have with their own friction."""
         return pose * c.copies + copy_of(c, p)
@@ -121,7 +144,7 @@ def grid_functions(dtype: torch.dtype) -> SimpleNamespace:
         """First of the 27 nodes of particle p at x, distance of x from it [dx], and weights along each axis."""
         i, j, k = base_node(c, x[0]), base_node(c, x[1]), base_node(c, x[2])
         f = x * c.inv_dx - vec3(real(i) + c.first, real(j) + c.first, real(k) + c.first)
-        first = ((copy_of(c, p) * c.n + i) * c.n + j) * c.n + k
+        first = ((field_of(c, p) * c.n + i) * c.n + j) * c.n + k
         return first, f, weights(f[0]), weights(f[1]), weights(f[2])
 
     @wp.func
@@ -185,13 +208,14 @@ def grid_functions(dtype: torch.dtype) -> SimpleNamespace:
 
 
 @functools.cache
-def forward_functions(dtype: torch.dtype, clamps: bool) -> SimpleNamespace:
+def forward_functions(dtype: torch.dtype, clamps: bool, bodies: bool) -> SimpleNamespace:
     """Parts of the forward kernels that are the same on every device: for a held particle, a node, and a particle."""
     t, functions = warp_types(dtype), grid_functions(dtype)
     Hold, (_, prescribed) = hold_type(dtype), vars(clamp_functions(dtype)).values()
     real, vec3, vec4, mat33, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.GridConstants
     copy_of, stencil = functions.copy_of, functions.stencil
     wall_mask, moved = functions.wall_mask, functions.moved
+    contact_change = body_functions(dtype, t.GridConstants).change if bodies else None
 
     @wp.func
     def hold_mass(
@@ -221,8 +245,9 @@ def forward_functions(dtype: torch.dtype, clamps: bool) -> SimpleNamespace:
         holds: wp.array2d(dtype=Hold),
         held_mass: wp.array(dtype=real),
         held_by: wp.array(dtype=wp.int32),
+        pairs: wp.array2d(dtype=real),
     ):
-        """v_i = (m v)_i / m_i + dt g where there is mass, then the boundary conditions.
+        """v_i = (m v)_i / m_i + dt g where there is mass, then the boundary conditions and contact of bodies.
 
         Held nodes move with their clamp. Their mass becomes -1, so that `grid_adjoint` knows them.
         """
@@ -231,6 +256,8 @@ def forward_functions(dtype: torch.dtype, clamps: bool) -> SimpleNamespace:
         if mv[3] > real(0.0):
             v = vec3(mv[0], mv[1], mv[2]) / mv[3] + c.dt * c.gravity
             v = wp.cw_mul(v, wall_mask(c, node, v))
+            if wp.static(bodies):
+                v += contact_change(c, pairs, grid, node)
             result = vec4(v[0], v[1], v[2], real(1.0))
         if wp.static(clamps):
             m = held_mass[node]
@@ -281,8 +308,8 @@ def forward_kernels(
     dtype: torch.dtype, scatter: str = "atomic", features: tuple[str, ...] = ()
 ) -> SimpleNamespace:
     """Kernels `cells`, `p2g`, `grid_update` and `g2p` for a precision, a scatter method and features of the model:
-    "contact" of particles, shapes other than planes that they touch, and "clamps"."""
-    contact, clamps = "contact" in features, "clamps" in features
+    "contact" of particles, shapes other than planes that they touch, "clamps", and several "bodies"."""
+    contact, clamps, bodies = "contact" in features, "clamps" in features, "bodies" in features
     Hold, held, prescribed = hold_type(dtype), *vars(clamp_functions(dtype)).values()
     t, functions = warp_types(dtype), grid_functions(dtype)
     Obstacle, touch = obstacle_type(dtype), contact_functions(dtype, features).contact
@@ -291,7 +318,7 @@ def forward_kernels(
     real, vec3, vec4, mat33, mat34, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.mat34, t.GridConstants
     stencil, moments, column = functions.stencil, functions.moments, functions.column
     obstacle_row = functions.obstacle_row
-    hold_mass, update_node, move_particle = vars(forward_functions(dtype, clamps)).values()
+    hold_mass, update_node, move_particle = vars(forward_functions(dtype, clamps, bodies)).values()
     gather, _ = gather_functions(dtype)
     module = f"neuma_lib.sim.forward_{str(dtype).removeprefix('torch.')}_{'_'.join((scatter, *features))}"
     kernel = functools.partial(wp.kernel, enable_backward=False, module=module)
@@ -378,9 +405,10 @@ def forward_kernels(
         holds: wp.array2d(dtype=Hold),
         held_mass: wp.array(dtype=real),
         held_by: wp.array(dtype=wp.int32),
+        pairs: wp.array2d(dtype=real),
     ):
         """Velocities of the nodes (`forward_functions`)."""
-        update_node(c, pose, wp.tid(), grid[cached], grid_v[cached], holds, held_mass, held_by)
+        update_node(c, pose, wp.tid(), grid[cached], grid_v[cached], holds, held_mass, held_by, pairs)
 
     @kernel
     def g2p(
@@ -456,12 +484,19 @@ def deformation_kernels(dtype: torch.dtype) -> SimpleNamespace:
 
     @kernel
     def advect_tracers(
-        c: GridConstants, cached: wp.int32, grid_v_rows: wp.array2d(dtype=mat34), x: wp.array(dtype=vec3)
+        c: GridConstants,
+        cached: wp.int32,
+        grid_v_rows: wp.array2d(dtype=mat34),
+        first_of: wp.array(dtype=wp.int32),
+        x: wp.array(dtype=vec3),
     ):
-        """x += dt v, interpolated over nodes with mass of the first copy. A tracer without such nodes stays."""
+        """x += dt v, interpolated over nodes with mass of a tracer's body in the first copy.
+
+        ``first_of`` has the first particle of that body. A tracer without such nodes stays.
+        """
         p = wp.tid()
         xp = x[p]
-        first, _, wi, wj, wk = stencil(c, 0, xp)
+        first, _, wi, wj, wk = stencil(c, first_of[p], xp)
         total = vec4()
         for i in range(3):
             for j in range(3):

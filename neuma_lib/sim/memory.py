@@ -19,6 +19,7 @@ _NODE_FLOATS = 8  # grid, grid_v of a node
 # if steps share their grids, and only the nodes that particles touch are kept:
 _NEXT_FLOATS = 9  # tau after the last step of a particle
 _REUSED_NODE_FLOATS = 12  # grid, grid_v and grad_grid of a node
+_BODIES_NODE_FLOATS = 8  # grad_before and grad_around of a node, with several bodies
 _KEPT_FLOATS = 4  # momentum and mass of a touched node, at most one for each particle
 _KEPT_ROW_BYTES = 8  # bounds of the touched nodes of a row
 
@@ -50,6 +51,7 @@ def plan_memory(
     total: bool = False,
     contact: bool = False,
     rows: int = 0,
+    bodies: bool = False,
 ) -> MemoryPlan:
     """The fastest plan that fits into memory.
 
@@ -61,6 +63,7 @@ def plan_memory(
         total: whether states include the total deformation.
         contact: whether states include the tangential displacement of contact of particles.
         rows: number of rows of nodes of all copies if the steps share their grids, 0 if each has its own.
+        bodies: whether there are several bodies.
 
     Raises:
         InputError: segments of a single step do not fit into `memory`.
@@ -69,7 +72,8 @@ def plan_memory(
     step, shared = itemsize * _STEP_FLOATS * particles, 0
     if rows:
         step += itemsize * _KEPT_FLOATS * particles + _KEPT_ROW_BYTES * rows
-        shared = itemsize * (_REUSED_NODE_FLOATS * nodes + _NEXT_FLOATS * particles)
+        node = _REUSED_NODE_FLOATS + bodies * _BODIES_NODE_FLOATS
+        shared = itemsize * (node * nodes + _NEXT_FLOATS * particles)
     else:
         step += itemsize * _NODE_FLOATS * nodes
     whole = state * (steps + 1) + step + shared

@@ -14,6 +14,7 @@ from torch import Tensor
 from neuma_lib.errors import InputError
 from neuma_lib.mechanics.catalogue import COURANT_LIMIT
 from neuma_lib.mechanics.law import Law, Weights
+from neuma_lib.sim.bodies import Pair
 from neuma_lib.sim.clamps import Clamp
 from neuma_lib.sim.colliders import Collider, contact_radius, unit_cube
 
@@ -58,6 +59,7 @@ class MPM:
         wall_cells: thickness of released walls [nodes].
         colliders: obstacles in the cube, for contact of particles only.
         clamps: regions whose particles follow a prescribed motion.
+        pairs: constants of the contact of bodies (`State.bodies`). Pairs that are not given have those of `Pair`.
 
     Raises:
         InputError: a value is out of range or unknown.
@@ -71,6 +73,7 @@ class MPM:
     wall_cells: int = 1
     colliders: tuple[Collider, ...] = ()
     clamps: tuple[Clamp, ...] = ()
+    pairs: tuple[Pair, ...] = ()
 
     def __post_init__(self):
         if not isinstance(self.grid, int) or self.grid < 6:
@@ -90,6 +93,10 @@ class MPM:
         object.__setattr__(self, "boundary", _six_conditions(self.boundary, self.contact))
         object.__setattr__(self, "colliders", tuple(self.colliders))
         object.__setattr__(self, "clamps", tuple(self.clamps))
+        object.__setattr__(self, "pairs", tuple(self.pairs))
+        named = [(pair.first, pair.second) for pair in self.pairs]
+        if len(set(named)) < len(named):
+            raise InputError("pairs", f"{named} must name each pair of bodies once")
         if self.contact != "particles" and self.colliders:
             raise InputError("colliders", f"need contact of particles, not of {self.contact}")
 
@@ -104,13 +111,16 @@ class MPM:
 
     @cached_property
     def frictions(self) -> tuple[float, ...]:
-        """Coulomb coefficients of the obstacles."""
-        return tuple(obstacle.friction for obstacle in self.obstacles)
+        """Coulomb coefficients of the obstacles and then of the pairs of bodies."""
+        return tuple(each.friction for each in (*self.obstacles, *self.pairs))
 
     @cached_property
     def frictionless(self) -> MPM:
         """The same model for all models that differ only in `frictions`."""
-        return self.with_friction(0.0) if self.contact == "particles" else self
+        if self.contact != "particles":
+            return self
+        pairs = tuple(replace(pair, friction=0.0) for pair in self.pairs)
+        return replace(self.with_friction(0.0), pairs=pairs)
 
     def with_friction(self, friction: float, given: bool = True) -> MPM:
         """This model with a Coulomb coefficient of all obstacles, or only of those that stick if not ``given``.
@@ -120,7 +130,8 @@ class MPM:
         """
         if self.contact != "particles":
             raise InputError("friction", f"needs contact of particles, not of {self.contact}")
-        changed = [friction if given or own == math.inf else own for own in self.frictions]
+        frictions = (obstacle.friction for obstacle in self.obstacles)
+        changed = [friction if given or own == math.inf else own for own in frictions]
         colliders = zip(self.colliders, changed[len(WALLS) :], strict=True)
         return replace(
             self,

@@ -24,7 +24,8 @@ class NativeTransfers:
     """Launches of a step. Arguments of the kernels are buffers of the workspace, or of this object, by name.
 
     Attributes:
-        grids: momentum and mass, velocity, and gradient of the nodes, shape (2 or 3, nodes + PADDING, 4).
+        grids: momentum and mass, velocity, and gradients of the nodes, shape (2 to 5, nodes + PADDING, 4). The last two
+            are those of `body_contact`, if there are several bodies.
         to_grid: from tau and the state to the velocities of the nodes.
         to_grid_again: the same in the reverse loop.
         to_particles: from these to the state after the step. F_trial is the F of that state if the key is True.
@@ -39,11 +40,16 @@ class NativeTransfers:
         self._ws = weakref.proxy(ws)  # which owns this object
         self._kernels = transfer_kernels(size.dtype, ws.features)
         self._deformation = deformation_kernels(size.dtype)
-        self.grids = ws.buffer((2 + size.differentiable, size.copies * model.nodes**3 + PADDING), "vec4")
-        self.spans = ws.buffer((size.copies * 6 * model.nodes**2,), dtype=torch.int32)
+        gradients = (3 if size.ranges else 1) if size.differentiable else 0
+        self.grids = ws.buffer((2 + gradients, size.fields * model.nodes**3 + PADDING), "vec4")
+        of_contact = self.grids[3:] if size.differentiable and size.ranges else self.grids[:2]
+        self.grad_before, self.grad_around = of_contact  # unused by one body
+        for unpadded in (self.grad_before, self.grad_around):
+            ws.add_view(unpadded, "vec4")
+        self.spans = ws.buffer((size.fields * 6 * model.nodes**2,), dtype=torch.int32)
         kept = size.n_cached_steps if self._keeps_nodes else 1
         self.kept = ws.buffer((kept, size.particles if self._keeps_nodes else 0), "vec4")
-        self.kept_spans = ws.buffer((kept, 2 * size.copies * model.nodes**2 + 1), dtype=torch.int32)
+        self.kept_spans = ws.buffer((kept, 2 * size.fields * model.nodes**2 + 1), dtype=torch.int32)
         self.mass_now, self.vol_now, self.radius_now = ws.mass, ws.vol0, ws.radius
         if model.clamps:
             self.mass_now, self.vol_now, self.radius_now = (
@@ -121,6 +127,7 @@ class NativeTransfers:
         launches = [self._launch(self._deformation.total_adjoint, N)] if ws.size.total else []
         launches.append(self._launch(k.g2p_adjoint, **trial))
         launches += [self._launch(k.held_adjoint, N, **trial)] if "clamps" in ws.features else []
+        launches += [self._launch(k.body_contact_adjoint)] if ws.size.ranges else []
         launches += [self._launch(k.grid_adjoint), self._launch(k.p2g_adjoint)]
         launches += [self._launch(k.touch_adjoint)] if "contact" in ws.features else []
         return launches

@@ -36,6 +36,7 @@ def rollout(
     steps: int,
     frames: Sequence[int],
     tracers: Tensor | None = None,
+    tracer_bodies: Sequence[int] = (),
     total: bool = False,
     skip_free_flight: bool = True,
     memory: float | None = None,
@@ -54,11 +55,12 @@ def rollout(
         steps: number of time steps, not less than the last frame, at which the simulation ends.
         frames: steps whose states are returned, strictly increasing, 0 is the initial state.
         tracers: positions of passive points that follow the velocity of the grid [m], shape (M, 3).
+        tracer_bodies: number of tracers of each body, one after the other, if the state has several bodies.
         total: also compute the total deformation, F_total = (I + dt C) F_total without plastic return, initially F.
             Differentiable like F.
         skip_free_flight: compute the steps before the first contact in closed form if the state is undeformed and
-            has a uniform velocity, equal to simulated steps to round-off in value and gradient. Not used with clamps
-            or if a gradient is required of v of shape (N, 3), F or C.
+            has a uniform velocity, equal to simulated steps to round-off in value and gradient. Not used with clamps,
+            several bodies, or if a gradient is required of v of shape (N, 3), F or C.
         memory: maximum bytes kept for the gradient, None for no limit. If it is less than the states of all steps
             need, these are recomputed segment by segment, with the same gradient.
         cache_bytes: maximum bytes for stresses, grids and caches of the laws, None for
@@ -66,7 +68,8 @@ def rollout(
         scatter: scatter method, see `scatter`. None chooses the fastest.
 
     Raises:
-        InputError: invalid frames, tracers or regions, or a particle starts outside the grid.
+        InputError: invalid frames, tracers or regions, a particle starts outside the grid, or several bodies with
+            contact of nodes or clamps.
         NonFiniteError: a particle became non-finite, moved by more than a cell in a step or left the grid; has
             `step` and `particle`.
     """
@@ -77,11 +80,29 @@ def rollout(
         given = f"shape {tuple(tracers.shape)} as {tracers.dtype}"
         raise InputError("tracers", f"{given} must be (M, 3) as {state.x.dtype}")
 
+    check_bodies(model, state)
+    if tracers is not None and state.bodies and sum(tracer_bodies) != len(tracers):
+        raise InputError(
+            "tracer_bodies",
+            f"{list(tracer_bodies)} must be the numbers of tracers of each body, {len(tracers)} in all",
+        )
+
     for region in regions:
         if region.law.grid not in (None, model.grid):
             _warn_of_another_grid(region.law.name, region.law.grid, model.grid)
     path, _ = fly_and_simulate(
-        model, regions, state, frames, tracers, total, skip_free_flight, 1, scatter, memory, cache_bytes
+        model,
+        regions,
+        state,
+        frames,
+        tracers,
+        total,
+        skip_free_flight,
+        scatter=scatter,
+        memory=memory,
+        cache_bytes=cache_bytes,
+        bodies=state.bodies,
+        tracer_bodies=tracer_bodies,
     )
     return path
 
@@ -156,9 +177,11 @@ def fly_and_simulate(
     memory: float | None = None,
     cache_bytes: float | None = None,
     frictions: Sequence[Sequence[float]] | None = None,
+    bodies: tuple[int, ...] = (),
+    tracer_bodies: Sequence[int] = (),
 ) -> tuple[Trajectory, list[NonFiniteError | None]]:
-    """`rollout` with checked arguments, for a state of several ``copies`` with equal numbers of particles, and their
-    `MPM.frictions` if they differ.
+    """`rollout` with checked arguments, for a state of several ``copies`` with equal numbers of particles, their
+    `MPM.frictions` if they differ, and the particles of each body of a copy if there are several.
 
     Returns one error per copy, or None. The states of a copy with an error are undefined. If all copies have one, the
     first is raised.
@@ -170,6 +193,11 @@ def fly_and_simulate(
                 "laws", "those with a viscous part share no launches", "Simulate them one by one"
             )
         regions, state, owners = both
+    ranges = tuple((size, body) for body, size in enumerate(bodies))
+    if both and bodies:  # branches belong to the bodies of their particles, in the same order
+        ends = torch.tensor(bodies).cumsum(0)
+        of_body = torch.bincount(torch.searchsorted(ends, owners.cpu(), right=True), minlength=len(bodies))
+        ranges += tuple((size, body) for body, size in enumerate(of_body.tolist()) if size)
 
     def of_laws(path: Trajectory) -> Trajectory:
         return merged(path, owners, count) if both else path
@@ -178,7 +206,8 @@ def fly_and_simulate(
         for part in (region.law.elasticity, region.law.plasticity):
             for own in getattr(part, "parts", (part,)):
                 _log_evaluation(type(own).__name__, own.native)
-    first = free_flight_steps(model, regions, state, frames[-1], copies) if skip_free_flight else 0
+    flies = skip_free_flight and not bodies
+    first = free_flight_steps(model, regions, state, frames[-1], copies) if flies else 0
     more = {"F_total": state.F} if total else {}
     if model.contact == "particles":
         more["stuck"] = state.stuck
@@ -198,13 +227,25 @@ def fly_and_simulate(
     inputs = (*start, *weights)
     if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
         cache_bytes = DEFAULT_CACHE_BYTES[x.device.type] if cache_bytes is None else cache_bytes
-        nodes, contact = copies * model.nodes**3, model.contact == "particles"
+        nodes, contact = copies * max(1, len(bodies)) * model.nodes**3, model.contact == "particles"
         rows = nodes // model.nodes if scatter == "native" else 0
-        plan = plan_memory(steps, len(x), nodes, x.element_size(), cache_bytes, memory, total, contact, rows)
+        plan = plan_memory(
+            steps,
+            len(x),
+            nodes,
+            x.element_size(),
+            cache_bytes,
+            memory,
+            total,
+            contact,
+            rows,
+            bool(bodies),
+        )
     simulation = Simulation(
-        model, regions, slices, state, steps, first, plan, scatter, total, copies, frictions
+        model, regions, slices, state, steps, first, plan, scatter, total, copies, frictions, ranges
     )
-    *states, seen = RolloutFunction.apply(simulation, [n - first for n in frames], tracers, *inputs)
+    passive = None if tracers is None else (tracers, tracer_bodies)
+    *states, seen = RolloutFunction.apply(simulation, [n - first for n in frames], passive, *inputs)
     path = Trajectory(frames, *states[:4], tracers=seen, **dict(zip(more, states[4:], strict=True)))
     return of_laws(path if flight is None else flight.followed_by(path)), simulation.errors
 
@@ -213,14 +254,14 @@ class RolloutFunction(torch.autograd.Function):
     """All steps as one function of the initial state and the weights."""
 
     @staticmethod
-    def forward(ctx, simulation, frames, tracers, *inputs):
+    def forward(ctx, simulation, frames, passive, *inputs):
         count = len(simulation.workspace.states)
         start, weights = inputs[:count], inputs[count:]
         ctx.simulation, ctx.frames = simulation, frames
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(*weights)
-        result = simulation.run(start, weights, frames, tracers)
-        if tracers is not None:
+        result = simulation.run(start, weights, frames, *(passive or ()))
+        if passive is not None:
             ctx.mark_non_differentiable(result[-1])
         return result
 
@@ -240,6 +281,18 @@ def checked_frames(frames: Sequence[int], steps: int) -> tuple[int, ...]:
     if frames[-1] > steps:
         raise InputError("frames", f"the last frame, {frames[-1]}, must not exceed the {steps} steps")
     return frames
+
+
+def check_bodies(model: MPM, state: State) -> None:
+    """Raise InputError unless the bodies of a state can touch each other and the pairs of the model are among them."""
+    if state.bodies and (model.contact != "particles" or model.clamps):
+        given = "clamps" if model.clamps else f"contact of {model.contact}"
+        raise InputError(
+            "state.bodies", f"several bodies exclude {given}", "Use contact of particles, no clamps"
+        )
+    count = max(1, len(state.bodies))
+    if any(pair.second >= count for pair in model.pairs):
+        raise InputError("pairs", f"name a body that is none of the {count} of the state")
 
 
 def check_inside(model: MPM, x0: Tensor) -> None:

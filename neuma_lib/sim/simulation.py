@@ -60,7 +60,8 @@ class Simulation:
         scatter: scatter method, see `scatter`. None chooses the fastest.
         total: whether the state includes the total deformation.
         copies: number of independent simulations in the state that share launches, see `kernels`.
-        frictions: Coulomb coefficients of the obstacles for each copy. None: those of the model.
+        frictions: `MPM.frictions` of each copy. None: those of the model.
+        ranges: consecutive ranges of a copy, with their numbers of particles and their bodies, if there are several.
 
     Attributes:
         errors: after `run`, the error of each copy, or None.
@@ -79,13 +80,21 @@ class Simulation:
         total: bool = False,
         copies: int = 1,
         frictions: Sequence[Sequence[float]] | None = None,
+        ranges: tuple[tuple[int, int], ...] = (),
     ):
         self.model, self.regions, self.steps, self.first, self.plan = model, regions, steps, first, plan
         x = state.x
         scatter = scatter or scatter_for(x.device, x.dtype)
         # Models that differ only in friction share workspaces.
         size = WorkspaceSize(
-            model.frictionless, len(x), x.dtype, x.device, total=total, copies=copies, scatter=scatter
+            model.frictionless,
+            len(x),
+            x.dtype,
+            x.device,
+            total=total,
+            copies=copies,
+            scatter=scatter,
+            ranges=ranges,
         )
         if model.changes:
             size = size._replace(n_poses=steps + 1)
@@ -119,8 +128,11 @@ class Simulation:
         weights: Sequence[Tensor],
         frames: Sequence[int],
         tracers: Tensor | None = None,
+        tracer_bodies: Sequence[int] = (),
     ) -> tuple[Tensor | None, ...]:
         """Run all steps from ``start`` (`Workspace.states`) and return these and tracers at the frames.
+
+        ``tracer_bodies`` has the number of tracers of each body, if there are several.
 
         Raises:
             NonFiniteError: every copy diverged. If only some did, `errors` has their errors.
@@ -133,7 +145,7 @@ class Simulation:
         if self._uses_graphs or self._loops:
             ws.load_weights(weights)
             weights = ws.weights
-        passive = None if tracers is None else _Tracers(ws, tracers, frames)
+        passive = None if tracers is None else _Tracers(ws, tracers, tracer_bodies, frames)
         self._make_loop(weights, None if passive is None else passive.repeated)
         faults = ws.faults.clone()
         self._copy_frames(0, [0], frames, result)
@@ -434,10 +446,10 @@ class Simulation:
 class _Tracers:
     """Passive points (M, 3) that move with the grid, and their positions at the frames, `seen` (T, M, 3)."""
 
-    def __init__(self, ws: Workspace, tracers: Tensor, frames: Sequence[int]):
+    def __init__(self, ws: Workspace, tracers: Tensor, bodies: Sequence[int], frames: Sequence[int]):
         self._ws, self._frame_of = ws, {n: index for index, n in enumerate(frames)}
         self._x = tracers.detach().clone(memory_format=torch.contiguous_format)
-        self._launch = ws.tracer_launch(self._x)
+        self._launch = ws.tracer_launch(self._x, bodies or (len(tracers),))
         self.repeated = Repeated(self._launch)
         self.seen = self._x.new_empty(len(frames), *self._x.shape)
         self.store(0)

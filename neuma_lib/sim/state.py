@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from neuma_lib.errors import InputError
+from neuma_lib.sim.bodies import MAX_BODIES
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,8 @@ class State:
         clamp: index of the clamp that holds each particle, or -1, shape (N,), by default from the positions.
         stuck: tangential displacements since particles stick to a `Collider` [m], shape (N, 3), by default zero.
         F_branch: deformation gradients of the viscous branch of a law, shape (N, 3, 3). None: relaxed.
+        bodies: number of particles of each body, one after the other. Each of several bodies has its own velocities on
+            the grid and touches the others as `body_contact` states. Without bodies all particles are one.
 
     Raises:
         InputError: shapes, precisions or devices do not match, or a value is not finite or a mass or volume not
@@ -41,6 +44,7 @@ class State:
     clamp: Tensor | None = None
     stuck: Tensor = None  # type: ignore[assignment]
     F_branch: Tensor | None = None
+    bodies: tuple[int, ...] = ()
 
     def __post_init__(self):
         x = self.x
@@ -76,6 +80,13 @@ class State:
                 raise InputError(f"state.{name}", f"{float(value.min()):g} must be positive")
         if self.clamp is not None and self.clamp.shape != (N,):
             raise InputError("state.clamp", f"shape {tuple(self.clamp.shape)} must be ({N},)")
+        bodies = tuple(self.bodies) if len(self.bodies) > 1 else ()
+        if bodies and (len(bodies) > MAX_BODIES or min(bodies) < 1 or sum(bodies) != N):
+            raise InputError(
+                "state.bodies",
+                f"{list(bodies)} must be the numbers of particles of at most {MAX_BODIES} bodies, {N} in all",
+            )
+        object.__setattr__(self, "bodies", bodies)
 
     @classmethod
     def rigid(
@@ -108,8 +119,8 @@ class State:
         return cls(x, v, mass, vol0, C=C.expand(len(x), 3, 3))
 
     @classmethod
-    def joined(cls, bodies: Sequence[State]) -> State:
-        """Concatenate the particles of several bodies."""
+    def joined(cls, bodies: Sequence[State], separate: bool = False) -> State:
+        """Concatenate the particles of several bodies, as one that sticks where they touch unless ``separate``."""
         x, v, F, C = (torch.cat(parts) for parts in zip(*(body.motion for body in bodies), strict=True))
         mass, vol0, stuck = (
             torch.cat([getattr(body, name) for body in bodies]) for name in ("mass", "vol0", "stuck")
@@ -123,7 +134,8 @@ class State:
             branches = torch.cat(
                 [relaxed.expand_as(body.F) if body.F_branch is None else body.F_branch for body in bodies]
             )
-        return cls(x, v, mass, vol0, F, C, torch.cat(clamps) if clamps else None, stuck, branches)
+        counts = tuple(len(body.x) for body in bodies) if separate else ()
+        return cls(x, v, mass, vol0, F, C, torch.cat(clamps) if clamps else None, stuck, branches, counts)
 
     def after(self, path: Trajectory, frame: int = -1) -> State:
         """The state at the frame of this index of a trajectory, from which a simulation continues exactly."""
@@ -138,7 +150,7 @@ class State:
         }
         optional = {"clamp": self.clamp, "F_branch": self.F_branch}
         given = {name: value.to(device) for name, value in optional.items() if value is not None}
-        return State(**moved, **given)
+        return State(**moved, **given, bodies=self.bodies)
 
     @property
     def density(self) -> Tensor:

@@ -82,10 +82,10 @@
         Real f[3][16];  // distance from the first node [dx]
         Real w[3][3][16], wd[3][3][16], slope[3][3][16];  // by axis and node: weights, moments and slopes
         Real w_ij[9][16];  // products of the weights of the first two axes
-        int first[16], line[16], k[16];  // first node, its row in the grid of the copy, and its place in the row
+        int first[16], line[16], k[16];  // first node, its row in the grid of the body, and its place in the row
     };
     Block block;
-    auto prepare = [&](const Real* p, int used, int copy) INLINE {
+    auto prepare = [&](const Real* p, int used, int field) INLINE {
         Row x[3];
         load_lanes(p, used, x);
         Indices base[3];
@@ -113,7 +113,7 @@
         const Indices line = base[0] * n + base[1];
         *(Indices*)block.line = line;
         *(Indices*)block.k = base[2];
-        *(Indices*)block.first = (copy * n * n + line) * n + base[2];
+        *(Indices*)block.first = (field * n * n + line) * n + base[2];
     };
     // Four numbers of an axis spread over the lanes of a row
     auto spread = [&](const Real (*w)[16], int l) INLINE {
@@ -142,29 +142,31 @@
         return SHUFFLE(a, a, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3);
     };
     #define EACH_BLOCK                                                                                       \
-        for (int copy = 0; copy < c.copies; ++copy)                                                          \
-            for (int begin = copy * c.particles, stop = begin + c.particles, used; begin < stop; begin += used)
+        for (int range = 0; range < c.copies * c.ranges; ++range)                                            \
+            for (int copy = range / c.ranges, own = range % c.ranges, field = copy * c.bodies + c.body_of[own], \
+                     begin = copy * c.particles + c.starts[own], stop = copy * c.particles + c.starts[own + 1], \
+                     used; begin < stop; begin += used)
     #define OPEN_BLOCK used = stop - begin < 16 ? stop - begin : 16
 
 // First and last node that particles touch in each row, from those of the rows of their first nodes. Nodes outside are
-// zero. `spans` has six numbers per row of a copy, one after the other: the first and the last of first nodes, of a sum
+// zero. `spans` has six numbers per row of a body in a copy, one after the other: the first and the last of first nodes, of a sum
 // over one axis, and of all nodes.
 //// spans
     const int lines = n * n;
-    auto clear = [&](int copy, Real* nodes, int grids, size_t size) {
-        int* const span = (int*)spans.data + 6 * lines * copy;
+    auto clear = [&](int field, Real* nodes, int grids, size_t size) {
+        int* const span = (int*)spans.data + 6 * lines * field;
         for (int r = 0; r < lines; ++r) {
             const int low = span[4 * lines + r], count = span[5 * lines + r] + 1 - low;
             for (int g = 0; g < (count > 0 ? grids : 0); ++g) {
-                Four* const p = (Four*)(nodes + g * size) + ((size_t)copy * lines + r) * n + low;
+                Four* const p = (Four*)(nodes + g * size) + ((size_t)field * lines + r) * n + low;
                 for (int k = 0; k < count; ++k) p[k] = zero;
             }
             span[r] = n, span[lines + r] = -3;
         }
     };
-    auto grow = [&](int copy) {
+    auto grow = [&](int field) {
         // The last two rows of an axis have no first nodes, so that the rows before another may be those of the last i.
-        int* const span = (int*)spans.data + 6 * lines * copy;
+        int* const span = (int*)spans.data + 6 * lines * field;
         for (int axis = 1; axis >= 0; --axis) {
             const int stride = axis ? 1 : n, added = axis ? 0 : 2;
             const int *low = span + (axis ? 0 : 2 * lines), *high = low + lines;
@@ -185,7 +187,7 @@
 
 // Nodes that particles touch of a step, one after the other, with their spans and, last, whether they fit.
 //// keep
-    const int rows_kept = c.copies * lines;
+    const int rows_kept = c.fields * lines;
     auto span_of = [&](int row) INLINE { return (int*)spans.data + (row / lines * 6 + 4) * lines + row % lines; };
     int* const kept_span = (int*)kept_spans.data;
     auto keep_nodes = [&] {
@@ -209,7 +211,7 @@
 // Sets the grid to the kept nodes and clears the gradients of the nodes.
 //// restore
     if (!kept_span[2 * rows_kept]) return 0;
-    for (int copy = 0; copy < c.copies; ++copy) clear(copy, (Real*)grid.data, grid.shape[0], grid.shape[1] * (size_t)4);
+    for (int field = 0; field < c.fields; ++field) clear(field, (Real*)grid.data, grid.shape[0], grid.shape[1] * (size_t)4);
     const Four* next = (const Four*)kept.data;
     for (int row = 0; row < rows_kept; ++row) {
         const int low = kept_span[2 * row], high = kept_span[2 * row + 1];
@@ -243,11 +245,11 @@
 
 //// p2g
     Four* const nodes = (Four*)grid.data;
-    for (int copy = 0; copy < c.copies; ++copy) clear(copy, (Real*)grid.data, grid.shape[0], grid.shape[1] * (size_t)4);
+    for (int field = 0; field < c.fields; ++field) clear(field, (Real*)grid.data, grid.shape[0], grid.shape[1] * (size_t)4);
     EACH_BLOCK {
         OPEN_BLOCK;
-        prepare((const Real*)x.data + 3 * begin, used, copy);
-        int* const span = (int*)spans.data + 6 * lines * copy;
+        prepare((const Real*)x.data + 3 * begin, used, field);
+        int* const span = (int*)spans.data + 6 * lines * field;
         Row A[9], m, stress;
         prepare_momentum(begin, used, A, m, stress);
         for (int l = 0; l < used; ++l) {
@@ -268,7 +270,7 @@
             }
         }
     }
-    for (int copy = 0; copy < c.copies; ++copy) grow(copy);
+    for (int field = 0; field < c.fields; ++field) grow(field);
     keep_nodes();
 
 // v_i = (m v)_i / m_i + dt g without walls and clamps
@@ -276,7 +278,7 @@
     const int lines = n * n;
     const Four gain = dt * Four{c.gravity[0], c.gravity[1], c.gravity[2], Real(0)};
     const int* const span = (const int*)spans.data;
-    for (int row = 0; row < c.copies * lines; ++row) {
+    for (int row = 0; row < c.fields * lines; ++row) {
         const int at = (row / lines * 6 + 4) * lines + row % lines, low = span[at], high = span[at + lines];
         for (size_t node = (size_t)row * n + low; node <= (size_t)row * n + high && low <= high; ++node) {
             const Four mv = ((const Four*)grid.data)[node], v = mv / mv[3] + gain;
@@ -304,7 +306,7 @@
     Rows all = {}, along_i = {}, along_j = {};
     EACH_BLOCK {
         OPEN_BLOCK;
-        prepare((const Real*)x.data + 3 * begin, used, copy);
+        prepare((const Real*)x.data + 3 * begin, used, field);
         for (int l = 0; l < used; ++l) {
             Row total, total_i, total_j;
             for (int i = 0; i < 3; ++i) {
@@ -365,7 +367,7 @@
     Rows along_i = {}, along_j = {}, along_k = {};
     EACH_BLOCK {
         OPEN_BLOCK;
-        prepare((const Real*)x.data + 3 * begin, used, copy);
+        prepare((const Real*)x.data + 3 * begin, used, field);
         Row g_x[3], g_v[3], place[3], D[9];
         const Row none = {};
         {
@@ -441,7 +443,7 @@
 //// grid_adjoint
     const int lines = n * n;
     const int* const span = (const int*)spans.data;
-    for (int row = 0; row < c.copies * lines; ++row) {
+    for (int row = 0; row < c.fields * lines; ++row) {
         const int at = (row / lines * 6 + 4) * lines + row % lines, low = span[at], high = span[at + lines];
         for (size_t node = (size_t)row * n + low; node <= (size_t)row * n + high && low <= high; ++node) {
             const Four mv = ((const Four*)grid.data)[node], v = mv / mv[3];
@@ -456,7 +458,7 @@
     Rows all = {}, moment_i = {}, moment_j = {}, along_i = {}, along_j = {}, along_k = {};
     EACH_BLOCK {
         OPEN_BLOCK;
-        prepare((const Real*)x.data + 3 * begin, used, copy);
+        prepare((const Real*)x.data + 3 * begin, used, field);
         Row A[9], m, stress;
         prepare_momentum(begin, used, A, m, stress);
         for (int l = 0; l < used; ++l) {

@@ -20,6 +20,7 @@ import warp as wp
 from neuma_lib.device import native_source, start_warp
 from neuma_lib.mechanics.singular_values_kernels import MATRICES
 from neuma_lib.sim.adjoint_kernels import adjoint_functions
+from neuma_lib.sim.body_contact import body_functions
 from neuma_lib.sim.clamp_kernels import clamp_functions, hold_type
 from neuma_lib.sim.contact_kernels import contact_functions, obstacle_type
 from neuma_lib.sim.kernels import NO_CONTACT, forward_functions, grid_functions, warp_types
@@ -41,16 +42,16 @@ def _native(dtype: torch.dtype, *parts: str, held: bool = False) -> str:
 @functools.cache
 def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> SimpleNamespace:
     """Kernels of the forward and of the reverse loop for a precision and features of the model (`forward_kernels`),
-    "walls" included, of which a node has a boundary condition."""
-    contact, clamps = "contact" in features, "clamps" in features
-    special_nodes = clamps or "walls" in features
+    "walls" included, of which a node has a boundary condition, or several bodies."""
+    contact, clamps, bodies = "contact" in features, "clamps" in features, "bodies" in features
+    special_nodes = clamps or bodies or "walls" in features
     Hold, (held, prescribed) = hold_type(dtype), vars(clamp_functions(dtype)).values()
     Obstacle, touching = obstacle_type(dtype), contact_functions(dtype, features)
     touch, touch_adjoint = touching.contact, touching.contact_adjoint
     t, functions = warp_types(dtype), grid_functions(dtype)
     real, vec3, vec4, mat33, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.GridConstants
     obstacle_row = functions.obstacle_row
-    forward, adjoint = forward_functions(dtype, clamps), adjoint_functions(dtype, clamps)
+    forward, adjoint = forward_functions(dtype, clamps, bodies), adjoint_functions(dtype, clamps, bodies)
     hold_mass, update_node, move_particle = forward.hold_mass, forward.update_node, forward.move_particle
     node_adjoint, deformation_adjoint = adjoint.node_adjoint, adjoint.deformation_adjoint
     moved_mask = functions.moved_mask
@@ -232,14 +233,15 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         holds: wp.array2d(dtype=Hold),
         held_mass: wp.array(dtype=real),
         held_by: wp.array(dtype=wp.int32),
+        pairs: wp.array2d(dtype=real),
     ):
         """As `kernels.grid_update`, for the nodes of the spans."""
         if wp.static(special_nodes):
             lines = c.n * c.n
-            for row in range(c.copies * lines):
+            for row in range(c.fields * lines):
                 span = (row / lines * 6 + 4) * lines + row % lines
                 for node in range(row * c.n + spans[span], row * c.n + spans[span + lines] + 1):
-                    update_node(c, pose, node, grids[0], grids[1], holds, held_mass, held_by)
+                    update_node(c, pose, node, grids[0], grids[1], holds, held_mass, held_by, pairs)
                     if wp.static(clamps):  # for the next step
                         held_mass[node] = real(0.0)
                         held_by[node] = 0
@@ -349,14 +351,20 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
             grad_x[p] = g_x + wp.transpose(holds[pose, clamp[p]].A) * (grad_v[p] + c.dt * g_x)
 
     @kernel
-    def grid_adjoint(c: GridConstants, spans: wp.array(dtype=wp.int32), grids: wp.array2d(dtype=vec4)):
+    def grid_adjoint(
+        c: GridConstants,
+        spans: wp.array(dtype=wp.int32),
+        grids: wp.array2d(dtype=vec4),
+        grad_before: wp.array(dtype=vec4),
+        grad_around: wp.array(dtype=vec4),
+    ):
         """As `adjoint_kernels.grid_adjoint`, for the nodes of the spans."""
         if wp.static(special_nodes):
             lines = c.n * c.n
-            for row in range(c.copies * lines):
+            for row in range(c.fields * lines):
                 span = (row / lines * 6 + 4) * lines + row % lines
                 for node in range(row * c.n + spans[span], row * c.n + spans[span + lines] + 1):
-                    node_adjoint(c, node, grids[0], grids[2])
+                    node_adjoint(c, node, grids[0], grids[2], grad_before, grad_around)
         else:
             grid_adjoint_loop(c, spans, grids[0], grids[2])
 
@@ -428,8 +436,29 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
     def add(c: GridConstants, grad_F_elastic: wp.array(dtype=mat33), grad_F: wp.array(dtype=mat33)):
         add_loop(grad_F_elastic, grad_F)
 
+    body_contact_adjoint = None
+    if bodies:
+        contact_adjoint = body_functions(dtype, GridConstants).adjoint
+
+        @kernel
+        def body_contact_adjoint(
+            c: GridConstants,
+            spans: wp.array(dtype=wp.int32),
+            grids: wp.array2d(dtype=vec4),
+            pairs: wp.array2d(dtype=real),
+            grad_before: wp.array(dtype=vec4),
+            grad_around: wp.array(dtype=vec4),
+        ):
+            """As `adjoint_kernels.body_contact_adjoint`, for the nodes of the spans."""
+            lines = c.n * c.n
+            for row in range(c.fields * lines):
+                span = (row / lines * 6 + 4) * lines + row % lines
+                for node in range(row * c.n + spans[span], row * c.n + spans[span + lines] + 1):
+                    contact_adjoint(c, pairs, grids[0], grids[2], node, grad_before, grad_around)
+
     return SimpleNamespace(
         add=add,
+        body_contact_adjoint=body_contact_adjoint,
         hold=hold,
         touch=touch_obstacles,
         p2g=p2g,

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from neuma_lib.sim import kernels
 from neuma_lib.sim.adjoint_kernels import adjoint_kernels
+from neuma_lib.sim.bodies import MAX_RANGES, pair_table
 from neuma_lib.sim.clamp_kernels import hold_type, holds
 from neuma_lib.sim.colliders import SIZES, contact_radius
 from neuma_lib.sim.contact_kernels import STICKING, distances, obstacle_type, obstacles
@@ -53,8 +54,21 @@ class WorkspaceSize(NamedTuple):
     differentiable: bool = False
     total: bool = False  # whether the state includes the total deformation
     copies: int = 1  # independent simulations with equal numbers of particles
+    ranges: tuple[
+        tuple[int, int], ...
+    ] = ()  # particles and body of each range of a copy, if there are several bodies
     scatter: str = "atomic"  # scatter method
     n_poses: int = 1  # steps of a segment if colliders or clamps change
+
+    @property
+    def bodies(self) -> int:
+        """Number of bodies of a copy."""
+        return 1 + max((body for _, body in self.ranges), default=0)
+
+    @property
+    def fields(self) -> int:
+        """Number of grids: one of each body of each copy."""
+        return self.copies * self.bodies
 
     @property
     def n_stresses(self) -> int:
@@ -76,11 +90,12 @@ class Workspace:
         states: x, v, F, C, optionally F_total, and stuck with contact of particles; grad_states: their gradients.
         tau: Kirchhoff stresses [Pa], shape (n_stresses, N, 3, 3).
         F_trial: trial deformation gradients, shape (n_cached_steps, N, 3, 3).
-        grid: momentum [kg m/s] and mass [kg] of the nodes, shape (n_cached_steps, copies * nodes^3, 4).
-        grid_v: velocity [m/s] of the nodes and 1 where there is mass, shape (n_cached_steps, copies * nodes^3, 4).
+        grid: momentum [kg m/s] and mass [kg] of the nodes, shape (n_cached_steps, fields * nodes^3, 4).
+        grid_v: velocity [m/s] of the nodes and 1 where there is mass, shape (n_cached_steps, fields * nodes^3, 4).
         mass, vol0: particle masses [kg] and initial volumes [m^3], shape (N,).
         radius: radii of the particles in contact [m], shape (N,).
-        frictions: Coulomb coefficients of the colliders for each copy, shape (copies, colliders).
+        frictions: `MPM.frictions` of each copy, shape (copies, colliders + pairs).
+        pairs: `bodies.pair_table` of each copy, shape (copies * bodies, bodies + 1).
         obstacles: colliders at the steps of a segment, or at one step if none changes, with the friction of each copy,
             shape (poses * copies, colliders).
         distances: values of the grids of colliders that are meshes.
@@ -131,7 +146,8 @@ class Workspace:
                 self.buffer((cached, nodes), "vec4"),
                 self.buffer((cached, nodes), "vec4"),
             )
-        self.frictions = np.zeros((size.copies, len(size.model.obstacles)))
+        self.frictions = np.zeros((size.copies, len(size.model.frictions)))
+        self.pairs = self.buffer((size.fields, size.bodies + 1), "real")
         self.obstacles = self._obstacles([0.0] * size.n_poses)
         self.distances = wp.array(
             distances(size.model.obstacles),
@@ -172,6 +188,8 @@ class Workspace:
                 self.native.record_adjoint()
             else:
                 self.grad_grid = self.buffer((2, nodes), "vec4")
+                of_bodies = nodes if size.ranges else 1
+                self.grad_before, self.grad_around = (self.buffer((of_bodies,), "vec4") for _ in range(2))
                 self._record_adjoint()
 
     def at(self, step: int) -> int:
@@ -202,8 +220,27 @@ class Workspace:
         self.vol0.copy_(vol0)
         self.radius.copy_(contact_radius(vol0))
         changed, self.frictions = not np.array_equal(frictions, self.frictions), frictions
+        if self.size.ranges:
+            self._load_pairs(mass, vol0)
         if changed and self.size.n_poses == 1:
             self._load_obstacles([0.0])
+
+    def _load_pairs(self, mass: Tensor, vol0: Tensor) -> None:
+        """Set the constants of the pairs of bodies."""
+        size, tables = self.size, []
+        masses, volumes = np.zeros((2, size.copies, size.bodies))
+        start = 0
+        for k, (count, body) in enumerate(size.ranges):
+            own = slice(start, start + count)
+            masses[:, body] += mass.double().reshape(size.copies, -1)[:, own].sum(dim=1).cpu().numpy()
+            if k == body:  # not a branch, whose volume is that of its body
+                volumes[:, body] = vol0.double().reshape(size.copies, -1)[:, own].sum(dim=1).cpu().numpy()
+            start += count
+        for own, frictions in zip(
+            volumes / masses, self.frictions[:, len(size.model.obstacles) :], strict=True
+        ):
+            tables.append(pair_table(size.model.pairs, frictions, own / size.model.dx**3, STICKING))
+        self.pairs.copy_(torch.from_numpy(np.concatenate(tables)))
 
     def pose_at(self, step: int) -> int:
         """Pose of the obstacles in a step."""
@@ -229,7 +266,8 @@ class Workspace:
         """Colliders at some times [s], with the friction of each copy."""
         poses = obstacles(self.size.model.obstacles, times, self.size.dtype)
         rows = np.repeat(poses, self.size.copies, axis=0)
-        rows["friction"] = np.tile(np.minimum(self.frictions, STICKING), (len(times), 1))
+        of_obstacles = self.frictions[:, : len(self.size.model.obstacles)]
+        rows["friction"] = np.tile(np.minimum(of_obstacles, STICKING), (len(times), 1))
         return wp.array(
             rows,
             dtype=obstacle_type(self.size.dtype),
@@ -308,12 +346,17 @@ class Workspace:
             return
         _run(self._trial, self.at(step), self.at(step + 1), self.cached_at(step))
 
-    def tracer_launch(self, tracers: Tensor) -> wp.Launch:
-        """A recorded launch, for `move_tracers` and `SegmentLoop`, that advects `tracers` (M, 3) in place."""
+    def tracer_launch(self, tracers: Tensor, bodies: Sequence[int]) -> wp.Launch:
+        """A recorded launch, for `move_tracers` and `SegmentLoop`, that advects `tracers` (M, 3) in place.
+
+        ``bodies`` has the number of tracers of each body.
+        """
         positions = wp.from_torch(tracers, dtype=warp_types(self.size.dtype).vec3)
-        return self.record(
-            self._deformation.advect_tracers, len(tracers), 0, self._rows(self.grid_v), positions
-        )
+        starts = np.cumsum([0, *(count for count, _ in self.size.ranges)])[: len(bodies)]
+        first_of = self.buffer((len(tracers),), dtype=torch.int32)
+        first_of.copy_(torch.from_numpy(np.repeat(starts, bodies)))
+        rows = self._rows(self.grid_v)
+        return self.record(self._deformation.advect_tracers, len(tracers), 0, rows, first_of, positions)
 
     def move_tracers(self, launch: wp.Launch, step: int) -> None:
         """Advect tracers by the node velocities of a step."""
@@ -333,6 +376,8 @@ class Workspace:
         if self.size.total:
             _run(self._total_adjoint, now, after)
         _run(self._g2p_adjoint, now, after, cached, side, self.sorted_at(step), self.pose_at(step))
+        if self.size.ranges:
+            _run(self._body_contact_adjoint, cached, side)
         _run(self._grid_adjoint, cached, side)
         _run(self._p2g_adjoint, now, cached, side, self.pose_at(step))
 
@@ -376,11 +421,15 @@ class Workspace:
 
     def buffer(self, shape: tuple[int, ...], kind: str = "", dtype: torch.dtype | None = None) -> Tensor:
         """Zeros of a kind of `warp_types`, or else numbers of a dtype, with a Warp view for the launches."""
-        warp_type = getattr(warp_types(self.size.dtype), kind) if kind else None
         tail = {"vec3": (3,), "vec4": (4,), "mat33": (3, 3)}.get(kind, ())
         tensor = torch.zeros(shape + tail, dtype=dtype or self.size.dtype, device=self.size.device)
-        self._views[id(tensor)] = wp.from_torch(tensor, dtype=warp_type)
+        self.add_view(tensor, kind)
         return tensor
+
+    def add_view(self, tensor: Tensor, kind: str = "") -> None:
+        """Make a tensor, which must live as long, an argument of `record`."""
+        warp_type = getattr(warp_types(self.size.dtype), kind) if kind else None
+        self._views[id(tensor)] = wp.from_torch(tensor, dtype=warp_type)
 
     def _rows(self, nodes: Tensor) -> wp.array:
         """View of nodes (..., nodes, 4) whose element b is the 3 x 4 matrix of nodes b, b + 1 and b + 2."""
@@ -418,14 +467,15 @@ class Workspace:
             "contact": self._contact,
             **{shape: self._contact and shape in shapes for shape in SIZES if shape != "plane"},
             "clamps": bool(self.size.model.clamps),
+            "bodies": bool(self.size.ranges),
             "walls": self.size.scatter == "native" and self.size.model.wall_nodes > 0,
         }
         return tuple(name for name, value in has.items() if value)
 
     @property
     def _node_count(self) -> int:
-        """Number of nodes of all copies."""
-        return self.size.copies * self.size.model.nodes**3
+        """Number of nodes of all bodies of all copies."""
+        return self.size.fields * self.size.model.nodes**3
 
     @property
     def _scattering_threads(self) -> int:
@@ -446,8 +496,9 @@ class Workspace:
             self.obstacles, self.distances, self.stuck, *held, self.held_mass, self.held_by, rows,
         )  # fmt: skip
         self._grid_update = self.record(
-            k.grid_update, nodes, 0, 0, self.grid, self.grid_v, self.holds, self.held_mass, self.held_by
-        )
+            k.grid_update, nodes, 0, 0,
+            self.grid, self.grid_v, self.holds, self.held_mass, self.held_by, self.pairs,
+        )  # fmt: skip
         self._g2p = self.record(
             k.g2p, N, 0, 0, 0, 0, 0,
             rows_v, self.x, self.v, self.C, self.F, self.F_trial, *held, self.faults,
@@ -471,7 +522,12 @@ class Workspace:
             self.x, self.v, self.C, self.F, rows_v,
             self.grad_v, self.grad_C, self.grad_F_trial, self.grad_x, self.grad_F, *held, grad_rows,
         )  # fmt: skip
-        self._grid_adjoint = self.record(k.grid_adjoint, nodes, 0, 0, self.grid, self.grad_grid)
+        of_contact = self.grad_before, self.grad_around
+        if self.size.ranges:
+            self._body_contact_adjoint = self.record(
+                k.body_contact_adjoint, nodes, 0, 0, self.grid, self.grad_grid, self.pairs, *of_contact
+            )
+        self._grid_adjoint = self.record(k.grid_adjoint, nodes, 0, 0, self.grid, self.grad_grid, *of_contact)
         self._p2g_adjoint = self.record(
             k.p2g_adjoint, N, 0, 0, 0, 0,
             self.x, self.v, self.C, self.tau, self.mass, self.vol0, self.radius,
@@ -526,6 +582,10 @@ def _grid_constants(size: WorkspaceSize):
     model, t = size.model, warp_types(size.dtype)
     c = t.GridConstants()
     c.particles, c.copies = size.particles // size.copies, size.copies
+    ranges = size.ranges or ((c.particles, 0),)
+    c.bodies, c.fields, c.ranges = size.bodies, size.fields, len(ranges)
+    counts, body_of = zip(*ranges, *[(0, 0)] * (MAX_RANGES - len(ranges)), strict=True)
+    c.starts, c.body_of = t.starts(*np.cumsum([0, *counts]).tolist()), t.body_of(*body_of)
     c.n, c.wall_nodes, c.first = model.nodes, model.wall_nodes, model.first_node
     c.faces = len(WALLS) if model.contact == "particles" else 0
     c.walls = t.walls(*(_CONDITION_CODES[condition] for condition in model.boundary))

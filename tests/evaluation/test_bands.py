@@ -11,11 +11,11 @@ from neuma_lib.evaluation.bands import (
     SILENT,
     _log_moduli,
     band,
-    constants_draws,
     corrected_draws,
     envelope,
     field_covariance,
 )
+from neuma_lib.evaluation.constants_draws import constants_draws
 from neuma_lib.evaluation.material_point import sheared, stress
 from neuma_lib.evaluation.response import inside, material_tests, response
 from neuma_lib.fitting.families import Family

@@ -16,7 +16,7 @@ import neuma_lib as nm
 from neuma_lib.cli import main
 from neuma_lib.evaluation.material_point import returned, stress
 from neuma_lib.export.materials import RULES, engine_material
-from neuma_lib.export.scenes import EngineScene, export_scene
+from neuma_lib.export.scenes import STICKS, EngineScene, export_scene
 from neuma_lib.io.exported import about_law
 from neuma_lib.io.laws import load_law, save_law
 from neuma_lib.mechanics.analytic import analytic_law
@@ -199,7 +199,7 @@ def test_mujoco_plays_a_fall(tmp_path):
     np.testing.assert_allclose((x[0] - x)[:, :, 1], np.broadcast_to(fallen[:, None], x.shape[:2]), atol=1e-6)
 
 
-@pytest.mark.parametrize("friction", [0.0, np.inf])
+@pytest.mark.parametrize("friction", [0.0, STICKS])
 def test_mujoco_stops_a_ball_at_the_floor(tmp_path, friction):
     pytest.importorskip("mujoco")
     scene = EngineScene.falling_cube(RHO, DT)
@@ -318,7 +318,7 @@ def test_a_filmed_scene_is_exported_with_the_constants_of_the_material(tmp_path,
     assert f"Play it with: python {out}/run.py" in capsys.readouterr().out
     content = json.loads((out / "scene.json").read_text())
     assert content["arguments"]["young_modulus"] == 4e4 and content["constants"] == constants
-    assert content["grid"] == 24 and content["grid_of_law"] is None
+    assert content["grid"] == 36 and content["grid_of_law"] is None  # that of the default settings
     assert content["scene"] == "BouncyBall" and content["steps"] == 30
     assert "constants of the material" in content["notes"]
     assert "primvars:displayColor" in (out / "scene.usda").read_text()

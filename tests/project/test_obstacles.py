@@ -79,6 +79,25 @@ def test_scenes_with_obstacles_have_contact_of_particles(changed):
     assert contacts == ["particles", "released"]
 
 
+def test_a_random_scene_may_have_another_friction(changed):
+    """Of the faces of the cube in its simulations, also those of experiments with it."""
+    study = {"random.friction": [0.3, 0.3]}
+    settings = changed(random={"count": 2}, simulation={"contact": "nodes"}, advanced=study)
+    known, (name, _) = settings.simulation.plain(), settings.random_scenes
+    falls = {"falls": {"title": "", "bodies": [{"scene": name}], "steps": 10}}
+    settings = changed(
+        random={"count": 2}, simulation={"contact": "nodes"}, experiments=falls, advanced=study
+    )
+    for own in (name, f"{name}+seed=1", "falls"):
+        constants = {key: known[key] for key in ("grid", "gravity", "boundary", "contact")}
+        model = simulator({"dt": 1e-3, **constants, **settings.obstacles(own)})
+        assert set(model.frictions) == {0.3}
+    assert changed(random={"count": 2}).obstacles(name) == {}
+    for wrong in ([0.0, 0.3], [0.4, 0.3]):
+        with refused("random.friction"):
+            changed(advanced={"random.friction": wrong})
+
+
 def test_videos_of_one_law_share_their_obstacles(with_colliders, changed):
     with refused("scenes.Steps.videos", problem="colliders"):
         changed(scenes={"Steps": {"like": "BouncyBall", "videos": [{"colliders": [STEP]}]}})

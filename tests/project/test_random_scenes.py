@@ -5,6 +5,8 @@ import hashlib
 import io
 import json
 import re
+from collections import Counter
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +19,7 @@ from neuma_lib.geometry import shapes
 from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.paper.random_scenes import failure, random_table
+from neuma_lib.project import loading
 from neuma_lib.project.random_scenes import DENSITY, FLAWS, LETTER, SHAPES, draw_scenes
 from neuma_lib.sim.model import MPM
 from neuma_lib.sim.rollout import rollout
@@ -109,6 +112,38 @@ def test_materials_outside_the_families_are_drawn_on_request(loaded):
             law = analytic_law(scene["law"], dt=scene["dt"])
             assert MPM(grid=36, dt=scene["dt"]).courant(law, DENSITY) <= 0.6 * (1 + 1e-3)
     assert not {*random.families} & {*random.outside}
+
+
+def test_the_calibration_has_every_kind_of_truth(raw):
+    """Candidates and others on the same grid and converged, all with an unknown friction."""
+    study = loading.read_yaml(ROOT / "config/studies/calibration.yaml")
+    settings = loading.load(loading.merged(raw, study), ROOT)
+    assert settings.random.is_development and len(settings.random_scenes) == 100
+    assert settings.identify.contact_friction == "fitted"
+    kinds = Counter()
+    for name in settings.random_scenes:
+        scene = settings.scene(name)
+        assert settings.obstacles(name) == {"boundary": scene.friction, "contact": "particles"}
+        converged = settings.scene_truth(name).grid > settings.simulation.grid
+        kinds[settings.random.family(name) in settings.random.families, converged] += 1
+    assert set(kinds) == set(product((False, True), repeat=2)) and min(kinds.values()) >= 20
+
+
+def test_friction_and_converged_truths_change_nothing_else(loaded):
+    """A share of the scenes has a converged truth, of every number of scenes; coefficients spread over their range."""
+    plain = drawn(loaded, count=40)
+    scenes = drawn(loaded, count=40, friction=[0.1, 0.8], converged=0.3)
+    for name, scene in scenes.items():
+        assert {key: value for key, value in scene.items() if key not in ("friction", "truth")} == plain[name]
+    truths = [scene.get("truth") for scene in scenes.values()]
+    for count in range(1, 41):
+        assert truths[:count].count("converged") == round(0.3 * count)
+    assert set(truths) == {None, "converged"}
+    frictions = np.array([scene["friction"] for scene in scenes.values()])
+    assert ((frictions >= 0.1) & (frictions <= 0.8)).all() and len(set(frictions)) > 30
+    # The median of 40 log-uniform draws is within 4 standard deviations of the centre.
+    centre, std = 0.5 * np.log(0.08), np.log(8) / (2 * 40**0.5)
+    assert abs(np.median(np.log(frictions)) - centre) < 4 * std
 
 
 @pytest.mark.slow

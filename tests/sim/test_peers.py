@@ -1,5 +1,6 @@
 """The comparison with other engines: it times only what simulates the same."""
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,7 +19,7 @@ class Fixed:
     """An engine with a given result that takes a given time."""
 
     def __init__(self, name, result, seconds=0.004):
-        self.name, self.result, self.time = name, result, (seconds, seconds)
+        self.name, self.result, self.time, self.peer = name, result, (seconds, seconds), peers.Peer()
 
     def prepare(self, case):
         return self.result
@@ -29,13 +30,13 @@ class Fixed:
 
 @pytest.fixture(scope="module")
 def own():
-    rollout = OwnRollout(CASE)
+    rollout = OwnRollout(CASE, "cpu")
     rollout.forward_backward()
     return rollout.result()
 
 
 def test_the_gradient_is_that_of_final_positions_along_the_direction():
-    rollout = OwnRollout(CASE)
+    rollout = OwnRollout(CASE, "cpu")
     rollout.forward_backward()
     _, gradient = rollout.result()
     *_, direction = CASE.arrays()
@@ -54,7 +55,7 @@ def test_a_plastic_case_yields(law, monkeypatch):
     results = []
     for yield_stress in (ANALYTIC["von_mises"]["plasticity"]["yield_stress"], 1e9):
         monkeypatch.setitem(ANALYTIC["von_mises"]["plasticity"], "yield_stress", yield_stress)
-        rollout = OwnRollout(replace(CASE, law=law, steps=50))
+        rollout = OwnRollout(replace(CASE, law=law, steps=50), "cpu")
         rollout.forward_backward()
         results.append(rollout.result())
     assert not peers.agree(*peers.differences(*results))
@@ -89,16 +90,23 @@ def test_a_table_has_times_of_a_step_and_paired_ratios():
 
 def test_missing_engines_are_refused(monkeypatch, tmp_path):
     monkeypatch.setattr(peers.importlib.util, "find_spec", lambda name: None)
-    with refused("taichi", remedy="pip install taichi"):
-        peers.require_taichi()
+    assert peers.installed(None) == []
+    with refused("taichi", problem="not installed"):
+        peers.installed(["taichi"])
     with refused("--against", remedy="git worktree"):
         peers.checked_checkout(tmp_path)
 
 
-def test_taichi_simulates_the_same(own):
-    pytest.importorskip("taichi")
-    child = peers.Child(peers.TAICHI, HERE)
+@pytest.mark.parametrize("name", peers.PEERS)
+def test_another_engine_simulates_the_same(name):
+    pytest.importorskip(name)
+    if name == "genesis" and not os.environ.get("GENESIS"):
+        pytest.skip("Genesis compiles for minutes: set GENESIS=1")
+    peer = peers.PEERS[name]
+    case = replace(CASE, law=peer.laws[-1])
+    rollout, child = OwnRollout(case, "cpu"), peers.Child(name, HERE)
+    rollout.forward_backward()
     try:
-        assert peers.agree(*peers.differences(own, child.prepare(CASE)))
+        assert peers.agree(*peers.differences(rollout.result(), child.prepare(case)), peer)
     finally:
         child.close()

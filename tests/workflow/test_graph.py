@@ -109,7 +109,7 @@ def test_every_table_can_be_planned(graph):
     assert graph["chamfer_table"] >= 4 and graph["prior"] == 8
 
 
-@behind("figures", "random", f"{RESULTS}/figures/realworld.png")
+@behind("figures", "random", f"{RESULTS}/figures/realworld.png", f"{RESULTS}/figures/reliability.png")
 def test_every_figure_can_be_planned(graph):
     modules = {module.stem for module in (ROOT / "neuma_lib/paper/figures").glob("[!_]*.py")}
     # i23d needs a splat: test_splat_scenes.py makes it.
@@ -146,6 +146,17 @@ def test_a_figure_that_shows_one_law_is_there_for_each_method(graph):
     assert all(
         f"/{method}/rollout.h5" in read["ext_time"] for method in ("nclaw", "neuma", "neuma_structured")
     )
+
+
+@behind("calibration")
+def test_a_calibration_needs_identifications_of_the_random_scenes_alone(graph):
+    records = list(graph.of_rule("calibration_record"))
+    assert len(records) == graph["identify"] == 12 and not graph["fit_neuma"] and not graph["evaluate"]
+    for job in records:
+        assert job.outputs[0].replace("calibration", "identified") in job.inputs
+        assert not any(map(is_truth, job.inputs))
+    (table,) = graph.of_rule("calibration_table")
+    assert sorted(table.inputs) == sorted(job.outputs[0] for job in records)
 
 
 @behind(f"{SCENE}/constants/metrics.json", f"{SCENE}/identified.png")

@@ -405,6 +405,12 @@ FIGURES = {
             "scenes": scenes_of("ablation_gradients"),
         },
     },
+    "reliability": {
+        "kind": "json",
+        "input": {"records": expand(f"{RESULTS}/{{scene}}/calibration.json", scene=SETTINGS.random_scenes)},
+        "params": {},
+        "default_target": False,
+    },
     "random_scenes": {
         "kind": "json",
         "input": {"metrics": random_files(SETTINGS.random.methods[:2], "metrics.json")},

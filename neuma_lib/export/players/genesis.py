@@ -19,16 +19,13 @@ stage = gs.Scene(
     sim_options=gs.options.SimOptions(dt=scene["dt"], substeps=1, gravity=scene["gravity"]),
     mpm_options=gs.options.MPMOptions(
         grid_density=scene["grid"],
-        particle_size=float(body["size"]),
+        particle_size=float(body["vol0"].mean() ** (1 / 3)),
         lower_bound=(-0.3, -0.3, -0.3),
         upper_bound=(1.3, 1.3, 1.3),
     ),
 )
-friction = scene["floor"]["friction"]
-stage.add_entity(
-    gs.morphs.Plane(normal=(0, 1, 0)),
-    gs.materials.Rigid(coup_friction=1e3 if friction == "sticks" else friction, needs_coup=True),
-)
+floor = gs.materials.Rigid(coup_friction=scene["floor"]["friction"], needs_coup=True)
+stage.add_entity(gs.morphs.Plane(normal=(0, 1, 0)), floor)
 material = getattr(gs.materials.MPM, scene["class"].removeprefix("MPM."))(**scene["arguments"])
 particles = stage.add_entity(gs.morphs.Nowhere(n_particles=len(body["x"])), material)
 stage.build()

@@ -1,0 +1,297 @@
+"""Rank what could be filmed next with an object whose material has been identified."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neuma_lib.config.identify import IdentifyConfig
+from neuma_lib.config.next import NextConfig
+from neuma_lib.coupling.initial_motion import InitialMotion
+from neuma_lib.coupling.reconstruction import Reconstruction
+from neuma_lib.errors import InputError, NonFiniteError
+from neuma_lib.fitting.candidate_experiments import as_cameras, draw_launches, second_cameras
+from neuma_lib.fitting.families import Family
+from neuma_lib.fitting.identified import FamilyFit
+from neuma_lib.fitting.next_experiment import (
+    Experiment,
+    Forecast,
+    Knowledge,
+    motion_std,
+    newly_determined,
+    spread,
+    stds,
+    undetermined,
+    unfilmed,
+)
+from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.mechanics.combinations import Values
+from neuma_lib.sim.batch import rollout_batch
+from neuma_lib.sim.model import MPM
+from neuma_lib.sim.state import Trajectory
+from neuma_lib.splatting.cameras import Cameras
+from neuma_lib.splatting.observation import joint_frames
+from neuma_lib.splatting.viewpoints import video_views
+
+MIN_GAIN = 0.05
+"""Relative decrease of what is ranked below which an experiment is useless."""
+_IDENTIFY = "Run `snakemake --cores 2 results/<scene>/identified.json` first"
+
+
+@dataclass(frozen=True)
+class Option:
+    """An experiment that could be done next.
+
+    Attributes:
+        kind: launch or camera.
+        settings: of its scene, or of the camera.
+        forecast: its expected result.
+        after: what is ranked, after the experiment (`Selection.goal`); smaller is better.
+        prediction: expected standard deviation of the chosen motion [m], or None.
+        body, path, cameras: its motion with the identified constants, and what would film it.
+    """
+
+    kind: str
+    settings: dict[str, Any]
+    forecast: Forecast
+    after: float
+    prediction: float | None
+    body: Reconstruction
+    path: Trajectory
+    cameras: Cameras
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Options for the next experiment, the best first.
+
+    Attributes:
+        goal: what is ranked: "prediction", its standard deviation [m]; "constants", the geometric mean of the standard
+            deviations of their logarithms; or "families", the probability of the rival relative to the identified one.
+        before: it, with what is known.
+        known: the identified family with what is known.
+        prediction: standard deviation of the chosen motion [m] with what is known, or None.
+        options: ranked.
+        failed: number of candidates whose simulation diverged.
+    """
+
+    goal: str
+    before: float
+    known: FamilyFit
+    prediction: float | None
+    options: list[Option]
+    failed: int
+    settings: IdentifyConfig
+
+    def gain(self, option: Option) -> float:
+        """Relative decrease of what is ranked."""
+        return 1 - option.after / self.before
+
+    @property
+    def useful(self) -> bool:
+        """Whether the best option gains at least `MIN_GAIN`."""
+        return self.gain(self.options[0]) >= MIN_GAIN
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain numbers for JSON."""
+        return {
+            "family": self.known.family.name,
+            "goal": self.goal,
+            "before": self.before,
+            "useful": self.useful,
+            "known": stds(self.known, self.settings),
+            **({"prediction_std": self.prediction} if self.prediction is not None else {}),
+            "failed": self.failed,
+            "candidates": [self._option(option) for option in self.options],
+        }
+
+    def _option(self, option: Option) -> dict[str, Any]:
+        fit, settings = option.forecast.fit, self.settings
+        return {
+            "kind": option.kind,
+            "settings": option.settings,
+            "after": option.after,
+            "expected": stds(fit, settings),
+            "becomes_determined": {
+                name: {"before": before, "after": after}
+                for name, (before, after) in newly_determined(self.known, fit, settings).items()
+            },
+            "log_bayes_factors": {
+                name: value if math.isfinite(value) else None
+                for name, value in option.forecast.evidence.items()
+            },
+            **({"prediction_std": option.prediction} if option.prediction is not None else {}),
+            "covariance": fit.covariance.tolist(),
+        }
+
+
+def read_fit(record: Mapping[str, Any], settings: IdentifyConfig) -> FamilyFit:
+    """The selected family with constants and covariance, from the content of identified.json.
+
+    Raises:
+        InputError: the family is not among the candidates of the settings, or the record is of an older version.
+    """
+    name, best = record.get("family"), record.get("best", {}).get("unbounded")
+    if name not in settings.families or best is None:
+        problem = f"family {name!r} is not in identify.families, or has no covariance"
+        raise InputError("identified.json", problem, _IDENTIFY)
+    family = Family(name, settings.families[name].plain())
+    values, covariance = np.array(best["values"]), np.array(best["covariance"])
+    return FamilyFit(family, family.bounded(values), covariance=covariance)
+
+
+def read_rivals(
+    record: Mapping[str, Any], settings: IdentifyConfig, fit: FamilyFit, count: int
+) -> list[tuple[Family, Values]]:
+    """The families with the lowest scores that could be the material instead, and their constants.
+
+    Families that contain the selected one are none, since they have the same images.
+    """
+    scored = [
+        (each["score"], name, {key: constant["value"] for key, constant in each["constants"].items()})
+        for name, each in record.get("families", {}).items()
+        if name != fit.family.name and name in settings.families and "score" in each and "constants" in each
+    ]
+    rivals = []
+    for _, name, values in sorted(scored, key=lambda entry: entry[0]):
+        family = Family(name, settings.families[name].plain())
+        if not family.contains(fit.family):
+            rivals.append((family, family.with_guesses({**values, **fit.values})))
+    return rivals[:count]
+
+
+def choose_next(
+    fit: FamilyFit,
+    filmed: Sequence[Experiment],
+    settings: IdentifyConfig,
+    lab: NextConfig,
+    *,
+    rivals: Sequence[tuple[Family, Values]] = (),
+    ties: bool = False,
+    derivatives: Tensor | None = None,
+    reframe: bool = True,
+    turn: bool = False,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+    log: Callable[[str], None] = lambda text: None,
+) -> Selection:
+    """Rank candidates for the next experiment.
+
+    Args:
+        fit: the identified family with the covariance of its unbounded constants.
+        filmed: the experiments in which it was identified. The first one gives body, duration and cameras.
+        settings: those of the identification.
+        lab: number, kinds and limits of the candidates.
+        rivals: other families to distinguish, with constants to start from.
+        ties: whether a rival predicts equally well, so that families are still to be distinguished.
+        derivatives: of the motion to predict, see `motion_derivatives`, or None.
+        reframe: whether the cameras are those of a rendered scene, which are placed so that they see the whole motion.
+            They are fixed otherwise.
+        turn: whether the body may start in other orientations.
+        seed: of the candidates.
+        progress: called with (finished candidates, their number).
+        log: receives a line for each candidate.
+
+    Raises:
+        InputError: all constants are determined and nothing else is asked, or no candidate is possible.
+        NonFiniteError: a simulation of an existing video, or of all candidates, diverges.
+    """
+    goal = "prediction" if derivatives is not None else "constants"
+    if goal == "constants" and not undetermined(fit, settings):
+        goal = "families"
+        if not (ties and rivals):
+            known = ", ".join(f"{name} {100 * std:.0f} %" for name, std in stds(fit, settings).items())
+            raise InputError(
+                "next",
+                f"all constants are determined already ({known}), and no other family predicts as well",
+                "Set next.predict to a motion to predict, or lower identify.determined under advanced",
+            )
+    known = Knowledge.of_videos(fit, filmed, settings, rivals)
+    log(f"noise {known.noise:.3g}, {len(rivals)} rivals")
+
+    def ranked(forecast: Forecast) -> tuple[float, float | None]:
+        predicted = None if derivatives is None else motion_std(derivatives, forecast.fit.covariance)
+        if goal == "families":
+            return math.exp(-min(forecast.evidence.values(), default=0.0)), predicted
+        return (spread(forecast.fit, settings) if predicted is None else predicted), predicted
+
+    now = Forecast(fit, np.zeros_like(fit.covariance), {})
+    before, prediction = ranked(now)
+    candidates = _candidates(filmed[0], known, lab, reframe, turn, seed)
+    options, failed = [], 0
+    for done, (kind, own, experiment, path) in enumerate(candidates):
+        try:
+            if experiment is None:
+                raise NonFiniteError("next", "the simulation diverges")
+            forecast = known.forecast(experiment, filmed[0] if kind == "camera" else None)
+        except NonFiniteError:
+            failed += 1
+        else:
+            after, predicted = ranked(forecast)
+            cameras = experiment.video[-1].cameras
+            options.append(Option(kind, own, forecast, after, predicted, experiment.body, path, cameras))
+            log(f"{kind} {own}: {before:.4g} to {after:.4g}")
+        if progress:
+            progress(done + 1, len(candidates))
+    if not options:
+        raise NonFiniteError("next", f"all {failed} candidates diverge with the identified constants")
+    options.sort(key=lambda option: (option.after, -min(option.forecast.evidence.values(), default=0.0)))
+    return Selection(goal, before, fit, prediction, options, failed, settings)
+
+
+def _candidates(
+    first: Experiment, known: Knowledge, lab: NextConfig, reframe: bool, turn: bool, seed: int
+) -> list[tuple[str, dict[str, Any], Experiment | None, Trajectory | None]]:
+    """Kind, settings, experiment and motion of each candidate; no experiment where the motion diverges."""
+    frames = joint_frames(first.video)
+    cameras = first.video[0].cameras
+    candidates: list[tuple[str, dict[str, Any], Experiment | None, Trajectory | None]] = []
+    if "camera" in lab.kinds:
+        (path,) = _motions(known, first.model, [(first.body, first.motion, frames)])
+        points = path.x.flatten(0, 1).cpu().numpy() if path else np.zeros((1, 3))
+        for place, camera in second_cameras(cameras[0], points, reframe)[: lab.candidates]:
+            video = [*first.video, unfilmed(frames, camera)]
+            candidates.append(("camera", dict(place), path and replace(first, video=video), path))
+    if "launch" in lab.kinds and len(candidates) < lab.candidates:
+        count = lab.candidates - len(candidates)
+        launches = draw_launches(first.model, first.body, first.motion, frames[-1], lab, count, seed, turn)
+        spaced = [
+            tuple(round(k * launch.steps / (len(frames) - 1)) for k in range(len(frames)))
+            for launch in launches
+        ]
+        motions = [(t.body, t.motion, own) for t, own in zip(launches, spaced, strict=True)]
+        for launch, own, path in zip(launches, spaced, _motions(known, first.model, motions), strict=True):
+            seen = cameras
+            if reframe and path:
+                views = video_views(
+                    path.x.flatten(0, 1).cpu().numpy(), len(cameras), cameras.width, cameras.height
+                )
+                seen = as_cameras(views, cameras)
+            experiment = Experiment(first.model, launch.motion, launch.body, [unfilmed(own, seen)])
+            candidates.append(("launch", launch.settings, experiment if path else None, path))
+    return candidates
+
+
+@torch.no_grad()
+def _motions(
+    known: Knowledge,
+    model: MPM,
+    motions: Sequence[tuple[Reconstruction, InitialMotion, tuple[int, ...]]],
+) -> list[Trajectory | None]:
+    """Motions with the identified constants, in the same launches where their frames end together."""
+    paths: list[Trajectory | None] = [None] * len(motions)
+    law = analytic_law(known.fit.family.law_spec(known.fit.values), model.dt)
+    for frames in {frames for *_, frames in motions}:
+        own = [k for k, motion in enumerate(motions) if motion[2] == frames]
+        starts = [motions[k][1].of_body(motions[k][0]) for k in own]
+        laws = [law.to(start.x.device) for start in starts]
+        batch = rollout_batch(model, laws, starts, steps=frames[-1], frames=frames, total=True)
+        for k, path in zip(own, batch, strict=True):
+            paths[k] = path
+    return paths

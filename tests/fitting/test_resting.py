@@ -1,0 +1,79 @@
+"""Stiffness from one still: derivatives, a synthetic twin of the silicone beam, and refusals."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from neuma_lib.errors import NonFiniteError
+from neuma_lib.fitting.resting import StillResiduals, fit_still
+from tests.support import hanging_beam as beam
+from tests.support.errors import refused
+
+pytestmark = pytest.mark.core
+
+
+def moved(degrees=(2.0, -3.0, 1.0), metres=(0.004, -0.003, 0.01)):
+    """The true pose with an error of a marker of 30 px."""
+    pose = beam.POSE.copy()
+    pose[:3, :3] = pose[:3, :3] @ Rotation.from_euler("xyz", degrees, degrees=True).as_matrix()
+    pose[:3, 3] += metres
+    return pose
+
+
+@pytest.fixture(scope="module")
+def still():
+    return beam.observe(beam.image_of(beam.resting_beam(0.015), 93.0))
+
+
+def test_derivatives_of_all_unknowns_equal_finite_differences(still):
+    residuals = StillResiduals(still, beam.resting_beam(0.03), moved(), beam.PLACEMENT + 0.002, 0.004, 80.0)
+    u, step = np.array([0.1, -0.2, 0.3, 0.2, 0.1, -0.3, 0.4, -0.1, 0.2, 0.5]), 1e-5
+    residuals.choose_visible(u)
+    value, J = residuals._evaluate(u)
+    assert (value[:-8] != 0).sum() > 150 and not residuals.visible.all()
+    far = value.max()
+    for k in range(10):
+        ends = [residuals._evaluate(u + sign * step * np.eye(10)[k])[0] for sign in (1, -1)]
+        slope = np.subtract(*ends) / (2 * step)
+        # A few points change between two segments of the outline or at ends of hidden parts within the step.
+        error = np.abs(J[:, k] - slope)
+        assert np.quantile(error, 0.97) < 1e-3 * np.abs(slope).max(), k
+        np.testing.assert_allclose(J[-8:, k], slope[-8:], atol=1e-5 * max(1.0, np.abs(slope[-8:]).max()))
+    assert far > 1
+
+
+def test_the_twin_of_the_silicone_beam_has_its_stiffness(still):
+    """Initial errors: 40 % of the stiffness, 4 degrees and 11 mm of the pose, 4 mm of the placement. The elements of
+    30 mm are 1.5 % too stiff, masks are exact to half a pixel."""
+    coarse = beam.resting_beam(0.03)
+    start = beam.PLACEMENT + [0.004, -0.002, 0.003]
+    fit = fit_still(still, coarse, [moved()], start, 0.004, 56.0)
+    assert fit.ratio == pytest.approx(93.0, rel=0.05)
+    assert abs(np.log(fit.ratio / 93.0)) < 0.015 + 3 * fit.log_std < 0.2
+    assert fit.contour_rms < 0.7 and fit.marker_rms < 1.2 and fit.iou > 0.985
+    assert np.abs(fit.placement - beam.PLACEMENT).max() < 3 * fit.placement_std.max() < 0.015
+    # a prediction with the true stiffness
+    given = fit_still(still, coarse, [moved()], start, 0.004, 93.0, fixed_ratio=True)
+    assert given.ratio == 93.0 and given.log_std == 0 and given.contour_rms < 0.8
+
+
+def test_a_mirrored_pose_does_not_change_the_fit(still):
+    """The marker alone has two poses, mirrored at the line of sight."""
+    coarse, wrong = beam.resting_beam(0.03), beam.POSE.copy()
+    wrong[:3, :3] = Rotation.from_euler("y", -48.0, degrees=True).as_matrix() @ wrong[:3, :3]
+    fits = [
+        fit_still(still, coarse, poses, beam.PLACEMENT, 0.004, 80.0)
+        for poses in ([wrong, moved()], [moved()])
+    ]
+    assert fits[0].cost == pytest.approx(fits[1].cost, rel=1e-4) and fits[0].contour_rms < 0.7
+
+
+def test_stills_without_a_body_are_refused(still):
+    coarse, behind = beam.resting_beam(0.03), beam.POSE.copy()
+    behind[2, 3] = -0.5
+    with refused("mask", problem="no body"):
+        fit_still(
+            beam.observe(np.zeros((20, 30), dtype=bool)), coarse, [beam.POSE], beam.PLACEMENT, 0.004, 93.0
+        )
+    with pytest.raises(NonFiniteError, match="in front of the camera"):
+        fit_still(still, coarse, [behind], beam.PLACEMENT, 0.004, 93.0)

@@ -1,0 +1,57 @@
+"""The experiment of docs/results/silicone.md with a known beam: same size, camera and clamp."""
+
+import numpy as np
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from neuma_lib.fitting.resting import RestingBody, Still, StillResiduals
+from neuma_lib.geometry.blocks import hexahedra
+from neuma_lib.geometry.outline import silhouette
+from neuma_lib.mechanics.law import Law
+from neuma_lib.sim.clamps import Clamp
+
+CLAMP, HIDDEN, PLACEMENT = 0.07, 0.05, np.array([-0.09, -0.036, -0.016])
+K = np.array([[903.7, 0.0, 640.0], [0.0, 903.7, 360.0], [0.0, 0.0, 1.0]])
+WIDTH, HEIGHT, MARKER = 1280, 720, 0.01 * np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
+POSE = np.eye(4)
+POSE[:3, :3] = Rotation.from_euler("yxz", [24.0, 172.0, 2.0], degrees=True).as_matrix()
+POSE[:3, 3] = 0.07, -0.01, 0.52
+
+
+def dumbbell():
+    """Surface of three blocks on one axis, 20 x 6 x 3 cm."""
+    x, y = np.array([-0.1, -0.07, 0.07, 0.1]), np.array([-0.03, -0.015, 0.015, 0.03])
+    outline = [(0, 0), (1, 0), (1, 1), (2, 1), (2, 0), (3, 0), (3, 3), (2, 3), (2, 2), (1, 2), (1, 3), (0, 3)]
+    ring = np.array([(x[i], y[j]) for i, j in outline])
+    bottom, top = (np.column_stack([ring, np.full(12, z)]) for z in (-0.015, 0.015))
+    blocks = [(0, 1, 2, 9, 10, 11), (2, 3, 8, 9), (3, 4, 5, 6, 7, 8)]
+    caps = np.array([(b[0], b[i], b[i + 1]) for b in blocks for i in range(1, len(b) - 1)])
+    sides = np.array([(i, (i + 1) % 12, (i + 1) % 12 + 12, i + 12) for i in range(12)])
+    faces = [caps[:, ::-1], caps + 12, sides[:, [0, 1, 2]], sides[:, [0, 2, 3]]]
+    return trimesh.Trimesh(np.concatenate([bottom, top]), np.concatenate(faces), process=False)
+
+
+def resting_beam(size, clamp=CLAMP, nu=0.49):
+    """The beam with elements of a size [m], clamped from x = clamp on."""
+    held = Clamp((clamp, -1.0, -1.0), (1.0, 1.0, 1.0))
+    law = Law.from_spec({"elasticity": {"name": "neo_hookean", "E": 200.0 * (1 + nu), "nu": nu}})
+    hidden = np.array([[HIDDEN, -1, -1], [1, 1, 1]])
+    return RestingBody(
+        hexahedra(dumbbell(), size, [held.lowest]), law, 100.0, [held], np.eye(3), hidden, 0.005
+    )
+
+
+def observe(mask, seed=1):
+    """A still of a mask, with corners of the marker that have an error of 0.5 px."""
+    local = MARKER @ POSE[:3, :3].T + POSE[:3, 3]
+    pixels = local @ K.T
+    noise = np.random.default_rng(seed).normal(0, 0.5, (4, 2))
+    return Still(mask, K, MARKER, pixels[:, :2] / pixels[:, 2:] + noise)
+
+
+def image_of(beam, ratio):
+    """Mask (HEIGHT, WIDTH) of the beam at rest with mu / rho, filled triangle by triangle."""
+    empty = np.zeros((HEIGHT, WIDTH), dtype=bool)
+    empty[:2, :2] = True  # any contour
+    residuals = StillResiduals(observe(empty), beam, POSE, PLACEMENT, 0.004, ratio)
+    return silhouette(residuals.surface(np.zeros(10))[1], beam.triangles, HEIGHT, WIDTH)

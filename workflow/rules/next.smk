@@ -1,0 +1,65 @@
+"""Which experiment to do next with an object whose material has been identified."""
+
+from neuma_lib.config.variants import replicate_folder
+
+
+@checked
+def predicted_experiment(wildcards):
+    """The experiment whose motion shall be predicted, in the replicate of the scene; None if there is none."""
+    name = SETTINGS.next.predict
+    if name is None:
+        return None
+    base, seeds = SETTINGS.replicate(subject(wildcards))
+    if name not in SETTINGS.experiments or len(SETTINGS.experiments[name].bodies) != 1:
+        problem = f"{name!r} is not an experiment with one body"
+        raise InputError("next.predict", problem, "Give the name of one in `experiments`, or null")
+    return f"experiments/{replicate_folder(name, seeds)}"
+
+
+def of_predicted(function):
+    """A function of wildcards, applied to the experiment to predict: nothing if there is none."""
+
+    @checked
+    def choose(wildcards):
+        name = predicted_experiment(wildcards)
+        return [] if name is None else function(SimpleNamespace(scene=name))
+
+    return choose
+
+
+rule next:
+    input:
+        **{name: of_each_video(of_replicate(file)) for name, file in BODY.items()},
+        kernels=kernels("binding", "geometry", "laws", "rendering"),
+        transforms=of_each_video(of_data("dynamic/transforms.json")),
+        velocity=of_each_video(of_replicate("velocity.json")),
+        identified=of_replicate("identified.json"),
+        predicted=of_predicted(
+            lambda own: [of_replicate(file)(own) for file in (*BODY.values(), "velocity.json")]
+        ),
+        obstacles=obstacle_meshes,
+    output:
+        page=f"{RESULTS}/{{scene}}/next.md",
+        record=f"{RESULTS}/{{scene}}/next.json",
+        picture=f"{RESULTS}/{{scene}}/next.png",
+    threads: identify_threads
+    resources:
+        gpu=GPU,
+    params:
+        simulation=simulation_settings,
+        densities=densities_of(SETTINGS.video_scenes),
+        identify=identify_settings,
+        next=SETTINGS.next.plain(),
+        predicted=of_predicted(
+            lambda own: {
+                "simulation": simulation_settings(own),
+                "density": densities_of(SETTINGS.body_scenes)(own)[0],
+                "frames": frame_steps(own),
+            }
+        ),
+        rendered=of_section(lambda scene: scene.has_truth and scene.images.dynamic is None),
+        seed=SETTINGS.seed,
+        exposure=exposure,
+        device=SETTINGS.device,
+    script:
+        "../scripts/next.py"
