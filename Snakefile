@@ -54,6 +54,13 @@ if workflow.is_main_process and Path(workflow.main_snakefile).resolve() == ROOT 
     checked(refuse_unknown)(
         requested_targets(),
         workflow.rules,
-        [*SETTINGS.scenes, *SETTINGS.methods, *SETTINGS.experiments, *SETTINGS.specimens, *SETTINGS.priors.laws, *tables],
+        [
+            *SETTINGS.scenes,
+            *SETTINGS.methods,
+            *SETTINGS.experiments,
+            *SETTINGS.specimens,
+            *SETTINGS.priors.laws,
+            *tables,
+        ],
         missing_settings,
     )

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from pydantic import Field, model_validator
+from pydantic import Field, PositiveFloat, model_validator
 
-from neuma_lib.config.base import Section
+from neuma_lib.config.base import Section, internal
 from neuma_lib.config.laws import LawConfig
 
 
@@ -23,9 +23,9 @@ class SpecimenConfig(Section):
     markers: tuple[str, ...] = Field(min_length=1, description="names of the markers in the files")
     along: str = Field("x", pattern="^-?[xyz]$", description="axis of the files along the beam")
     up: str = Field("y", pattern="^-?[xyz]$", description="axis of the files that points up")
-    length: float = Field(gt=0, description="free length of the beam [m]")
-    height: float = Field(gt=0, description="height of its section [m]")
-    width: float = Field(gt=0, description="width of its section [m]")
+    size: tuple[PositiveFloat, PositiveFloat, PositiveFloat] = Field(
+        description="free length, height and width of the beam [m]"
+    )
     density: float = Field(gt=0, description="density of the material [kg/m^3]")
     root: tuple[float, float] = Field(
         description="coordinate along of the end of the clamp in the files, and its standard deviation [m]"
@@ -35,8 +35,8 @@ class SpecimenConfig(Section):
     )
     law: LawConfig = Field(description="law with guesses of its constants")
     fitted: tuple[str, ...] = Field(min_length=1, description="fitted constants of the law")
-    cells: tuple[int, ...] = Field((4, 6), min_length=1, description="cells along the height, a fit for each")
     duration: float = Field(1.0, gt=0, description="compared time after the release [s]")
+    cells: tuple[int, ...] = internal((4, 6), "cells along the height, with a fit for each", min_length=1)
 
     @model_validator(mode="after")
     def _consistent(self) -> SpecimenConfig:

@@ -141,7 +141,7 @@ def specimen_problem(
     settings: SpecimenConfig, tracks: Sequence[MarkerTracks], names: Sequence[str]
 ) -> tuple[Beam, Family, list[Record], Place]:
     """Arguments of `fit_specimen` from settings and the tracks of their records, in the axes of the files."""
-    beam = Beam(settings.length, settings.height, settings.width, settings.density)
+    beam = Beam(*settings.size, settings.density)
     records = [
         Record(name, own.turned(settings.along, settings.up), record.load)
         for name, own, record in zip(names, tracks, settings.records, strict=True)
