@@ -8,8 +8,8 @@ import numpy as np
 
 from neuma_lib.errors import InputError
 
-_STILL = 0.02
-"""Share of the largest displacement up to which markers count as not released."""
+_STILL = 0.05
+"""Share of the largest displacement up to which markers count as not released, more than the noise of a record."""
 
 
 @dataclass(frozen=True)
@@ -48,9 +48,12 @@ class MarkerTracks:
         return MarkerTracks(self.times, self.positions @ axes.T)
 
     def release(self) -> float:
-        """Time of the last frame before the markers move [s]."""
-        moved = np.abs(self.positions - self.positions[0]).max(axis=(1, 2))
-        return float(self.times[max(int((moved > _STILL * moved.max()).argmax()) - 1, 0)])
+        """Time of the last frame before the markers move [s], that is before they move by half of what they do."""
+        centre = self.positions.mean(1)
+        moved = np.linalg.norm(centre - centre[0], axis=1)
+        half = int((moved > 0.5 * moved.max()).argmax())
+        still = np.flatnonzero(moved[: half + 1] <= _STILL * moved.max())
+        return float(self.times[still[-1]])
 
     def before(self, release: float) -> np.ndarray:
         """Mean positions [m] of the frames up to a time [s], shape (M, 3)."""

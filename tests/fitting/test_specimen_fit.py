@@ -41,11 +41,11 @@ def twin(load, cells, noise=1e-4, release=0.1234, seed=1):
 
 @pytest.mark.slow
 def test_constants_and_damping_of_a_twin():
-    """Constants within 5 % and damping within 10 %, from a coarser grid than that of the twin, and wrong guesses.
+    """Constants within 5 % and damping within 10 % from wrong guesses, an uncertain place, and noise of 0.1 mm.
 
     The time constant of the branch is seen by the change of damping with frequency, that is from two loads.
     """
-    records = [Record(f"{load}", twin(load, 4, seed=k), load) for k, load in enumerate((0.0, 0.05))]
+    records = [Record(f"{load}", twin(load, 3, seed=k), load) for k, load in enumerate((0.0, 0.05))]
     guess = {
         "elasticity": {**LAW["elasticity"], "E": 2.2e5},
         "viscosity": {"name": "maxwell", "modulus": 3e4, "relaxation": 0.02},
@@ -57,10 +57,10 @@ def test_constants_and_damping_of_a_twin():
         Place((-0.018, 0.003), (0.061, 0.002)),
         fitted=("E", "modulus", "relaxation"),
         cells=3,
+        duration=0.7,
     )
-    assert abs(fit.values["E"] / 2.7e5 - 1) < 0.05
-    fast = fit.values["E"] + 2.8 * fit.values["modulus"]  # E of motion that is faster than the relaxation
-    assert abs(fast / (2.7e5 + 2.8 * 2.2e4) - 1) < 0.05
+    truth = {"E": 2.7e5, "modulus": 2.2e4, "relaxation": 0.025}
+    assert all(abs(fit.values[name] / value - 1) < 0.05 for name, value in truth.items()), fit.values
     for record in fit.records:
         assert abs(record.release - 0.1234) < 2e-3
         assert record.largest < 0.03 * BEAM.length
@@ -141,7 +141,7 @@ def test_files_of_markers(tmp_path):
     np.testing.assert_allclose(turned.positions[..., 1], -read.positions[..., 0])
     assert np.linalg.det(np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])) > 0
     np.testing.assert_allclose(turned.positions[..., 2], -read.positions[..., 1])
-    assert 0.10 <= tracks.release() <= 0.15
+    assert tracks.release() == twin(0.0, 2, noise=2e-4).release() == pytest.approx(0.13, abs=0.011)
     with refused("a.csv"):
         read_markers(tmp_path / "a.csv", ("s",))
     (tmp_path / "b.csv").write_text("t_s,p_x_m,p_y_m,p_z_m\n0,1,,2\n")
