@@ -99,6 +99,21 @@ def _parser() -> argparse.ArgumentParser:
     following.add_argument("--cores", type=int, default=2, help="CPU cores to use (default %(default)s)")
     following.add_argument("--configfile", nargs="+", default=[], metavar="FILE", help=CONFIGFILE)
 
+    lab = _command(
+        commands,
+        _lab,
+        "lab: repeat the choice in a simulated lab until the material is known",
+        "Chooses the best launch or camera, renders it, identifies all videos of the scene together, and repeats this "
+        "until all constants are determined or nothing more can be learned. The choice does not read the true "
+        "material. Writes lab.md and lab.json to the folder. Example: neuma lab results/ClayCat",
+    )
+    lab.add_argument("folder", metavar="FOLDER", help="folder of a rendered scene, in results/")
+    lab.add_argument(
+        "--experiments", type=int, default=4, help="maximum number of experiments (default %(default)s)"
+    )
+    lab.add_argument("--cores", type=int, default=2, help="CPU cores to use (default %(default)s)")
+    lab.add_argument("--configfile", nargs="+", default=[], metavar="FILE", help=CONFIGFILE)
+
     law = _group(commands, "law", "export a learned material to one file, or show such a file")
     export = _command(
         law,
@@ -285,23 +300,45 @@ def _demo(options: argparse.Namespace) -> int:
     return status
 
 
-def _next(options: argparse.Namespace) -> int:
+def _identified_folder(options: argparse.Namespace) -> tuple[Path, list[Path], Any]:
+    """Folder of a scene, its settings files, and a function that makes targets with settings files."""
     from neuma_lib.extras import require
     from neuma_lib.project.project import Project, remembered_settings
 
     folder = Path(options.folder).absolute()
     settings, root = Project.find(folder, options.configfile)
     settings.scene(folder.name)
+    require("snakemake", "workflow")
+    files = [Path(file).absolute() for file in options.configfile] or remembered_settings(folder, root)
+    command = [sys.executable, "-m", "snakemake", f"--cores={options.cores}"]
+
+    def make(files: Sequence[Path], target: str) -> int:
+        given = ["--configfile", *map(str, files)] if files else []
+        return subprocess.run([*command, *given, "--", target], cwd=root).returncode
+
+    return folder, files, make
+
+
+def _lab(options: argparse.Namespace) -> int:
+    from neuma_lib.project.lab import run_lab
+
+    folder, files, make = _identified_folder(options)
+    complete = run_lab(folder, files, options.experiments, make, print)
+    if complete:
+        print(f"Experiments and constants: {folder / 'lab.md'}")
+    return int(not complete)
+
+
+def _next(options: argparse.Namespace) -> int:
+    from neuma_lib.project.project import project_folder
+
+    folder, files, make = _identified_folder(options)
     if not (folder / "identified.json").is_file():
         problem = "does not exist, so the material has not been identified"
         remedy = f"Run `snakemake --cores {options.cores} {options.folder}/identified.json` first"
         raise InputError(folder / "identified.json", problem, remedy)
-    require("snakemake", "workflow")
-    files = [Path(file).absolute() for file in options.configfile] or remembered_settings(folder, root)
-    command = [sys.executable, "-m", "snakemake", f"--cores={options.cores}"]
-    command += ["--configfile", *map(str, files)] if files else []
     page = folder / "next.md"
-    status = subprocess.run([*command, "--", str(page.relative_to(root))], cwd=root).returncode
+    status = make(files, page.relative_to(project_folder(folder)).as_posix())
     if status == 0:
         print("\n".join(line for line in page.read_text().splitlines() if line[:2] in ("1.", "2.", "3.")))
         print(f"All candidates and pictures: {page}")

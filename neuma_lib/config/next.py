@@ -12,10 +12,11 @@ from neuma_lib.config.base import Section, internal
 class NextConfig(Section):
     """Candidates for the next experiment with an object, and what the lab can do."""
 
-    kinds: tuple[Literal["launch", "camera"], ...] = Field(
-        ("launch", "camera"),
+    kinds: tuple[Literal["launch", "turned", "camera"], ...] = Field(
+        ("launch", "turned", "camera"),
         min_length=1,
-        description="launch: another initial motion of the object; camera: a second camera for the first launch",
+        description="launch: another initial motion of the object; turned: also another orientation at the start; "
+        "camera: a second camera for the first launch",
     )
     max_height: float = Field(
         0.7, gt=0, description="maximum initial y of the centre of the bounding box [m]"

@@ -59,6 +59,8 @@ class CapturedConfig(Section):
     grid: int | None = internal(None, "grid cells along each side of the box; null: captures.grid", ge=8)
 
 
+MAX_BODIES = 5
+"""Bodies of a scene, as of `neuma_lib.sim.bodies`, which settings do not import."""
 OF_THE_TRUTH = ("shape", "height", "velocity", "law", "appearance")
 """Keys of the simulation and the renders of the truth, unknown for a captured object."""
 OF_A_VIDEO = ("steps",)
@@ -70,8 +72,45 @@ OF_A_SPLAT = {
 """Defaults of a scene with a splat: half a second of fall from half a metre."""
 
 
+class SceneBodyConfig(Section):
+    """One of several bodies of a scene, which touch each other."""
+
+    shape: str = Field(description="name of a shape, or the path of a mesh, as of a scene")
+    size: float | None = Field(
+        None, gt=0, description="longest side of the bounding box [m]; null: the shape's own"
+    )
+    height: float = Field(description="initial y of the centre of the bounding box [m]")
+    center: tuple[float, float] = Field(
+        (0.5, 0.5), description="initial x and z of the centre of the bounding box [m]"
+    )
+    rotation: Vector = Field(
+        (0.0, 0.0, 0.0), description="rotation vector of the shape, before it is placed [rad]"
+    )
+    velocity: Vector = Field((0.0, 0.0, 0.0), description="initial velocity [m/s]")
+    spin: Vector = Field(
+        (0.0, 0.0, 0.0), description="initial angular velocity about the centre of mass, world axes [rad/s]"
+    )
+    density: Annotated[float, Field(gt=0)] | SplitDensityConfig = Field(
+        1000.0, description="mass density, as of a scene [kg/m^3]"
+    )
+    law: LawConfig = Field(description="the true material")
+    appearance: AppearanceConfig = Field(description="appearance in Blender")
+
+
+class PairConfig(Section):
+    """Contact of two bodies of a scene."""
+
+    bodies: tuple[str, str] = Field(description="names of the two bodies")
+    friction: float | None = Field(
+        None, ge=0, description="Coulomb coefficient; null: they stick while they press on each other"
+    )
+
+
 class SceneConfig(Section):
-    """A simulated object with its true law and the prior of its reconstruction, a captured object, or a splat."""
+    """A simulated object with its true law and the prior of its reconstruction, a captured object, or a splat.
+
+    Or several bodies, each with its own shape, start and law, in place of these keys of the scene.
+    """
 
     like: str | None = Field(None, description="scene with the settings that this one does not set")
     shape: str | None = Field(
@@ -84,6 +123,10 @@ class SceneConfig(Section):
     height: float | None = Field(description="initial y of the centre of the bounding box [m]")
     center: tuple[float, float] = Field(
         (0.5, 0.5), description="initial x and z of the centre of the bounding box [m]"
+    )
+    rotation: Vector = Field(
+        (0.0, 0.0, 0.0),
+        description="rotation vector of the shape, before it is placed at height and center [rad]",
     )
     velocity: Vector | None = Field(description="initial velocity [m/s]")
     spin: Vector = Field(
@@ -101,6 +144,10 @@ class SceneConfig(Section):
     friction: float | None = internal(
         None, "Coulomb coefficient of the faces of the cube; null: simulation.boundary", ge=0
     )
+    bodies: dict[str, SceneBodyConfig] = Field(
+        {}, description="two to five bodies by name, in place of shape, height, velocity, law and appearance"
+    )
+    pairs: tuple[PairConfig, ...] = Field((), description="friction between bodies. Other pairs stick")
     law: LawConfig | None = Field(description="the true material, used by the ground truth only")
     truth: TruthConfig = Field(TruthConfig(), description="resolution of the ground truth")
     dt: float = Field(gt=0, description="time step of the reconstruction, the unit of frames and steps [s]")
@@ -136,8 +183,8 @@ class SceneConfig(Section):
 
     @property
     def has_truth(self) -> bool:
-        """Whether the true law and motion are known. They are not for captured objects and splats."""
-        return self.captured is None and self.splat is None
+        """Whether the true law and motion of one body are known. They are not for captured objects and splats."""
+        return self.captured is None and self.splat is None and not self.bodies
 
     @model_validator(mode="before")
     @classmethod
@@ -151,11 +198,13 @@ class SceneConfig(Section):
             raw = {**raw, "splat": {"file": raw["splat"]}}
         if raw.get("splat"):
             return {**OF_A_SPLAT, **raw}
+        if raw.get("bodies"):
+            return {**dict.fromkeys(OF_THE_TRUTH), "prior": "jelly", **raw}
         return {**dict.fromkeys((*OF_THE_TRUTH, *OF_A_VIDEO)), **raw} if raw.get("captured") else raw
 
     @model_validator(mode="after")
     def _truth_is_whole(self) -> SceneConfig:
-        unknown = OF_A_SPLAT if self.splat else {}
+        unknown = OF_A_SPLAT if self.splat else dict.fromkeys(OF_THE_TRUTH) if self.bodies else {}
         for key in (*OF_THE_TRUTH, *OF_A_VIDEO):
             if self.captured is None and getattr(self, key) is None and unknown.get(key, ...) is not None:
                 raise ValueError(f"{key}: null is for scenes of captures only; give a value")
@@ -163,6 +212,25 @@ class SceneConfig(Section):
             raise ValueError(
                 "splat: this scene is one of a capture; give the scene of the splat another name"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _bodies_are_whole(self) -> SceneConfig:
+        if not self.bodies:
+            if self.pairs:
+                raise ValueError("pairs: need bodies")
+            return self
+        if not 2 <= len(self.bodies) <= MAX_BODIES:
+            raise ValueError(f"bodies: {len(self.bodies)} must be 2 to {MAX_BODIES}")
+        others = [key for key in (*OF_THE_TRUTH, "splat", "captured") if getattr(self, key) is not None]
+        others += [key for key in ("clamps", "videos") if getattr(self, key)]
+        if others or self.images != SuppliedConfig():
+            raise ValueError(f"{', '.join(others or ['images'])}: exclude bodies; leave them out")
+        named = [frozenset(pair.bodies) for pair in self.pairs]
+        if any(len(names) < 2 or not names <= set(self.bodies) for names in named):
+            raise ValueError(f"pairs: each must name two of {', '.join(self.bodies)}")
+        if len(set(named)) < len(named):
+            raise ValueError("pairs: two entries are of the same bodies; remove one")
         return self
 
     @model_validator(mode="after")

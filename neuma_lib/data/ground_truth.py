@@ -17,7 +17,7 @@ import trimesh
 from torch import Tensor
 
 from neuma_lib.errors import InputError
-from neuma_lib.geometry.volume import check_apart, sample_tracers, sample_volume
+from neuma_lib.geometry.volume import check_apart, sample_tracers, sample_volume, signed_distance
 from neuma_lib.mechanics.density import Density, density_at
 from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.model import MPM, consecutive
@@ -59,6 +59,7 @@ class GroundTruth:
             sampling floor of the Chamfer distance.
         vol0: particle volumes [m^3], shape (N,).
         mass: particle masses [kg], shape (N,).
+        body, tracer_body: index of the body of each particle (N,) and of each of ``tracers`` (M,).
     """
 
     frames: tuple[int, ...]
@@ -67,6 +68,8 @@ class GroundTruth:
     tracers_again: Tensor
     vol0: Tensor
     mass: Tensor
+    body: Tensor
+    tracer_body: Tensor
 
 
 def simulate_ground_truth(
@@ -78,6 +81,7 @@ def simulate_ground_truth(
     tracers: int,
     seed: int,
     stored: int | None = None,
+    separate: bool = False,
     device: torch.device | str = "cpu",
 ) -> GroundTruth:
     """Fill bodies with particles and simulate them on one grid.
@@ -91,6 +95,8 @@ def simulate_ground_truth(
         seed: of particle and tracer positions.
         stored: largest number of particles of each body in the result, which are drawn from all of them and represent
             their volume. None: all.
+        separate: whether bodies touch each other with the friction of ``model.pairs``. Otherwise they stick where they
+            share nodes of the grid.
         device: of the simulation; the result is on the CPU.
 
     Raises:
@@ -111,7 +117,10 @@ def simulate_ground_truth(
         torch.as_tensor(sample_tracers(surface, tracers, seed=seed + 1 + k), dtype=torch.float32)
         for k in range(2)
     ]
-    together = State.joined(solids)
+    passive = torch.cat(start)
+    owner = _bodies_at([body.mesh for body in bodies], passive)
+    by_body = torch.argsort(owner, stable=True) if separate else torch.arange(len(passive))
+    together = State.joined(solids, separate)
     for k, collider in enumerate(model.colliders):
         inside = int((collider.surface(together.x)[0] < 0).sum())
         if inside:
@@ -124,8 +133,11 @@ def simulate_ground_truth(
             together.to(device),
             steps=max(frames),
             frames=frames,
-            tracers=torch.cat(start).to(device),
+            tracers=passive[by_body].to(device),
+            tracer_bodies=torch.bincount(owner, minlength=len(bodies)).tolist() if separate else (),
         ).cpu()
+    moved = torch.empty_like(path.tracers)
+    moved[:, by_body] = path.tracers
     split = len(start[0])
     counts, first, drawn, share = [len(solid.x) for solid in solids], 0, [], []
     for count in counts:
@@ -138,11 +150,21 @@ def simulate_ground_truth(
     return GroundTruth(
         frames=tuple(frames),
         path=replace(path, **{name: getattr(path, name)[:, picked] for name in ("x", "v", "F", "C")}),
-        tracers=path.tracers[:, :split],
-        tracers_again=path.tracers[:, split:],
+        tracers=moved[:, :split],
+        tracers_again=moved[:, split:],
         vol0=represented * together.vol0[picked],
         mass=represented * together.mass[picked],
+        body=torch.arange(len(bodies)).repeat_interleave(torch.tensor(counts))[picked],
+        tracer_body=owner[:split],
     )
+
+
+def _bodies_at(meshes: Sequence[trimesh.Trimesh], points: Tensor) -> Tensor:
+    """Index (P,) of the solid that contains each point (P, 3) [m], the nearest one within round-off of the surfaces."""
+    if len(meshes) == 1:
+        return torch.zeros(len(points), dtype=torch.int64)
+    distances = [signed_distance(mesh, points.double().numpy()) for mesh in meshes]
+    return torch.from_numpy(np.argmin(distances, axis=0))
 
 
 def change_by_a_doubled_grid(truth: GroundTruth, half: GroundTruth) -> float:

@@ -41,6 +41,7 @@ from neuma_lib.splatting.viewpoints import video_views
 
 MIN_GAIN = 0.05
 """Relative decrease of what is ranked below which an experiment is useless."""
+_LENGTHS = ("height", "center", "velocity")  # settings with lengths [m] or [m/s]
 _IDENTIFY = "Run `snakemake --cores 2 results/<scene>/identified.json` first"
 
 
@@ -98,25 +99,30 @@ class Selection:
         """Whether the best option gains at least `MIN_GAIN`."""
         return self.gain(self.options[0]) >= MIN_GAIN
 
-    def as_dict(self) -> dict[str, Any]:
-        """Plain numbers for JSON."""
+    def as_dict(self, scale: float = 1.0) -> dict[str, Any]:
+        """Plain numbers for JSON, with lengths in metres of a room of which one has ``scale`` metres of the box."""
+        ranked = scale if self.goal == "prediction" else 1.0
         return {
             "family": self.known.family.name,
             "goal": self.goal,
-            "before": self.before,
+            "before": self.before / ranked,
             "useful": self.useful,
             "known": stds(self.known, self.settings),
-            **({"prediction_std": self.prediction} if self.prediction is not None else {}),
+            **({"prediction_std": self.prediction / scale} if self.prediction is not None else {}),
             "failed": self.failed,
-            "candidates": [self._option(option) for option in self.options],
+            "candidates": [self._option(option, scale) for option in self.options],
         }
 
-    def _option(self, option: Option) -> dict[str, Any]:
+    def _option(self, option: Option, scale: float) -> dict[str, Any]:
         fit, settings = option.forecast.fit, self.settings
+        own = {
+            key: (np.array(value) / scale).tolist() if key in _LENGTHS and scale != 1.0 else value
+            for key, value in option.settings.items()
+        }
         return {
             "kind": option.kind,
-            "settings": option.settings,
-            "after": option.after,
+            "settings": own,
+            "after": option.after / (scale if self.goal == "prediction" else 1.0),
             "expected": stds(fit, settings),
             "becomes_determined": {
                 name: {"before": before, "after": after}
@@ -126,7 +132,7 @@ class Selection:
                 name: value if math.isfinite(value) else None
                 for name, value in option.forecast.evidence.items()
             },
-            **({"prediction_std": option.prediction} if option.prediction is not None else {}),
+            **({"prediction_std": option.prediction / scale} if option.prediction is not None else {}),
             "covariance": fit.covariance.tolist(),
         }
 
@@ -176,7 +182,6 @@ def choose_next(
     ties: bool = False,
     derivatives: Tensor | None = None,
     reframe: bool = True,
-    turn: bool = False,
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
     log: Callable[[str], None] = lambda text: None,
@@ -193,7 +198,6 @@ def choose_next(
         derivatives: of the motion to predict, see `motion_derivatives`, or None.
         reframe: whether the cameras are those of a rendered scene, which are placed so that they see the whole motion.
             They are fixed otherwise.
-        turn: whether the body may start in other orientations.
         seed: of the candidates.
         progress: called with (finished candidates, their number).
         log: receives a line for each candidate.
@@ -223,7 +227,7 @@ def choose_next(
 
     now = Forecast(fit, np.zeros_like(fit.covariance), {})
     before, prediction = ranked(now)
-    candidates = _candidates(filmed[0], known, lab, reframe, turn, seed)
+    candidates = _candidates(filmed[0], known, lab, reframe, seed)
     options, failed = [], 0
     for done, (kind, own, experiment, path) in enumerate(candidates):
         try:
@@ -246,7 +250,7 @@ def choose_next(
 
 
 def _candidates(
-    first: Experiment, known: Knowledge, lab: NextConfig, reframe: bool, turn: bool, seed: int
+    first: Experiment, known: Knowledge, lab: NextConfig, reframe: bool, seed: int
 ) -> list[tuple[str, dict[str, Any], Experiment | None, Trajectory | None]]:
     """Kind, settings, experiment and motion of each candidate; no experiment where the motion diverges."""
     frames = joint_frames(first.video)
@@ -258,9 +262,16 @@ def _candidates(
         for place, camera in second_cameras(cameras[0], points, reframe)[: lab.candidates]:
             video = [*first.video, unfilmed(frames, camera)]
             candidates.append(("camera", dict(place), path and replace(first, video=video), path))
-    if "launch" in lab.kinds and len(candidates) < lab.candidates:
-        count = lab.candidates - len(candidates)
-        launches = draw_launches(first.model, first.body, first.motion, frames[-1], lab, count, seed, turn)
+    turned = [kind == "turned" for kind in lab.kinds if kind != "camera"]
+    left = lab.candidates - len(candidates)
+    for k, turn in enumerate(turned):
+        count = (k + 1) * left // len(turned) - k * left // len(turned)
+        if count < 1:
+            continue
+        own_seed = seed + int(turn)
+        launches = draw_launches(
+            first.model, first.body, first.motion, frames[-1], lab, count, own_seed, turn
+        )
         spaced = [
             tuple(round(k * launch.steps / (len(frames) - 1)) for k in range(len(frames)))
             for launch in launches

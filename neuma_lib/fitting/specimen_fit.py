@@ -36,6 +36,7 @@ _END = 0.6  # share of the length beyond which markers are
 _NEIGHBOURS = 200  # particles whose affine motion a marker follows
 _DIFFERENCE = 0.03  # of unbounded constants
 _STEPS = {"place": 1e-4, "release": 5e-4}  # differences [m], [s]
+_PRIORS = 2  # last residuals
 _EARLY = 0.02  # frames before the release that are compared [s]
 
 
@@ -232,9 +233,10 @@ def fit_specimen(
         residuals, start, jacobian, x_scale=scale, ftol=1e-3, xtol=1e-3, max_nfev=iterations, loss="linear"
     )
     p, J = fit.x, fit.jac
-    # Residuals of a record are errors of the model, which all of its frames share.
-    share = 2 * fit.cost / max(len(records), 1)
-    covariance = np.linalg.pinv(J.T @ J) * max(share, 1.0)
+    # Residuals of a record are errors of the model, which all of its frames share. Priors are not of records.
+    share = max(2 * fit.cost / len(records), 1.0)
+    data, priors = J[:-_PRIORS], J[-_PRIORS:]
+    covariance = np.linalg.pinv(data.T @ data / share + priors.T @ priors)
     deviations = np.sqrt(np.diag(covariance))
     u = np.array(constants(p))
     values = family.bounded(u)

@@ -112,12 +112,8 @@ def nearest(points: Tensor, points_of: Sequence[int], queries: Tensor, queries_o
     sizes = torch.tensor(points_of, device=device)
     sets = torch.arange(count, device=device)
     of = sets.repeat_interleave(sizes)
-    low, high = (
-        points.new_empty(count, 3).scatter_reduce_(
-            0, of[:, None].expand(-1, 3), points, kind, include_self=False
-        )
-        for kind in ("amin", "amax")
-    )
+    ranges = [own.aminmax(dim=0) for own in points.split(list(points_of))]
+    low, high = torch.stack([own.min for own in ranges]), torch.stack([own.max for own in ranges])
     # as many cells along the longest side as possible without more cells than points
     extent = (high - low).amax(dim=1)
     along = sizes.to(points).pow(1 / 3).floor().clamp(min=1)

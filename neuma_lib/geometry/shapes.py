@@ -21,6 +21,7 @@ import numpy as np
 import trimesh
 from scipy import ndimage
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 from skimage import measure
 
 from neuma_lib.errors import InputError
@@ -490,6 +491,7 @@ def place(
     height: float,
     center: Sequence[float],
     resolution: int = 96,
+    rotation: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> trimesh.Trimesh:
     """The solid at its initial position in a scene.
 
@@ -497,8 +499,15 @@ def place(
         name, size, resolution: see :func:`build`.
         height: y of the bounding box's centre [m].
         center: x and z of the bounding box's centre [m].
+        rotation: rotation vector of the solid [rad]. Its size is that before the rotation.
     """
     mesh = build(name, size, resolution)
+    if any(rotation):
+        R = Rotation.from_rotvec(rotation).as_matrix()
+        turned = mesh.vertices @ R.T
+        shift = (turned.min(axis=0) + turned.max(axis=0)) / 2
+        mesh.vertices = turned - shift
+        mesh.metadata.update(rotation=R.tolist(), shift=shift.tolist())
     mesh.apply_translation([center[0], height, center[1]])
     return mesh
 
@@ -506,7 +515,7 @@ def place(
 def to_nominal(mesh: trimesh.Trimesh, points: Array) -> tuple[Shape, Array]:
     """The solid of a mesh from :func:`build`, and points (n,3) [m] transformed to its nominal frame.
 
-    The mesh may have been translated since, but not rotated or scaled. Points are in its current frame.
+    The mesh may have been translated since, and rotated by :func:`place`. Points are in its current frame.
 
     Raises:
         InputError: the mesh was not created by :func:`build`.
@@ -514,6 +523,8 @@ def to_nominal(mesh: trimesh.Trimesh, points: Array) -> tuple[Shape, Array]:
     if "solid" not in mesh.metadata:
         raise InputError("mesh", "was not created by geometry.shapes.build, so its parts are unknown")
     local = np.asarray(points, dtype=np.float64) - mesh.bounds.mean(axis=0)
+    if "rotation" in mesh.metadata:
+        local = (local + mesh.metadata["shift"]) @ np.array(mesh.metadata["rotation"])
     return mesh.metadata["solid"], local / mesh.metadata["scale"] + np.asarray(mesh.metadata["centre"])
 
 

@@ -29,6 +29,8 @@ QUANTITIES = {
     "mass": ("kg", "particle masses, shape (N,)"),
     "tracers": ("m", "positions of passive tracers, shape (T, M, 3)"),
     "tracers_again": ("m", "passive tracers of another sampling of the same body, shape (T, M, 3)"),
+    "body": ("1", "index of the body of each particle, if several touch, shape (N,)"),
+    "tracer_body": ("1", "index of the body of each passive tracer, if several touch, shape (M,)"),
     "starts": ("m", "start positions of passive tracers, shape (M, 3)"),
     "floor": ("1e-4 m^2", "Chamfer distances of two samplings of the true body at the frames, shape (T,)"),
     "indptr": ("1", "row starts of a sparse matrix, shape (rows + 1,)"),
@@ -37,7 +39,7 @@ QUANTITIES = {
     "images": ("1", "pictures of a figure, colours 0 to 255, shape (rows, columns, H, W, 3)"),
 }
 
-INTEGERS = ("frames", "indptr", "indices")
+INTEGERS = ("frames", "indptr", "indices", "body", "tracer_body")
 """Quantities that are indices or counts: integers that are not negative."""
 _HEAP = b"GCOL\1\0\0\0"
 """Signature and version of a global heap."""

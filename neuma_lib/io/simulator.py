@@ -1,4 +1,4 @@
-"""The simulator from its settings, whose colliders and clamps are plain and may name the files of meshes."""
+"""The simulator from its settings, whose colliders, clamps and pairs are plain and may name the files of meshes."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from neuma_lib.config.obstacles import is_mesh_file
 from neuma_lib.errors import InputError
+from neuma_lib.sim.bodies import Pair
 from neuma_lib.sim.clamps import Clamp
 from neuma_lib.sim.colliders import Collider
 from neuma_lib.sim.model import MPM
@@ -20,13 +21,14 @@ def simulator(constants: Mapping[str, Any]) -> MPM:
 
 
 def with_obstacles(constants: Mapping[str, Any]) -> dict[str, Any]:
-    """Arguments of `MPM` with colliders and clamps in place of their settings (`ColliderConfig.arguments`).
+    """Arguments of `MPM` with colliders, clamps and pairs in place of their settings (`ColliderConfig.arguments`).
 
     Raises:
         InputError: a value is wrong, or the file of a mesh cannot be read. It names the entry.
     """
     arguments = dict(constants)
-    for name, make in {"colliders": _collider, "clamps": lambda settings: Clamp(**settings)}.items():
+    makers = {"colliders": _collider, "clamps": lambda own: Clamp(**own), "pairs": lambda own: Pair(**own)}
+    for name, make in makers.items():
         made = []
         for k, settings in enumerate(constants.get(name, ())):
             try:

@@ -30,6 +30,12 @@ if TYPE_CHECKING:
 Files = dict[str, Any]
 """Paths by name: one path, or a list of several."""
 EvaluatedOn = Literal["particles", "training_particles"]
+AS_IDENTIFIED: dict[str, Any] = {
+    "covariance_from": "total",
+    "gaussian_motion": "affine",
+    "start": "identified",
+}
+"""Options with which Gaussians follow the particles as in `identify`, from the initial motion that it fitted."""
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from neuma_lib.methods.base import Case, Files, Method, Preset, friction_options
+from neuma_lib.methods.base import AS_IDENTIFIED, Case, Files, Method, Preset, friction_options
 
 
 class Constants(Method):
@@ -11,7 +11,7 @@ class Constants(Method):
     presets = {
         "constants": Preset(
             "Constants",
-            {"covariance_from": "total", "gaussian_motion": "affine", "start": "identified"},
+            AS_IDENTIFIED,
             note="The analytic law whose family and few constants fit the training video best, launched with the "
             "initial motion of the same fit. Nothing else is learned.",
         )

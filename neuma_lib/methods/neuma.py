@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from neuma_lib.config.motion import WithPrior
 from neuma_lib.config.training import TrainingConfig
-from neuma_lib.methods.base import Case, Files, Method, Preset, training_inputs
+from neuma_lib.methods.base import AS_IDENTIFIED, Case, Files, Method, Preset, training_inputs
 
 
 class NeumaOptions(TrainingConfig, WithPrior):
@@ -32,6 +32,13 @@ class Neuma(Method):
             "Gaussians, which also carry the tracers.",
         ),
         "neuma_without_adaptor": Preset("NeuMA w/o ΔM", {"rank": None}),
+        "neuma_same_inputs": Preset(
+            "NeuMA, inputs of Constants",
+            AS_IDENTIFIED,
+            note="NeuMA with all that the row Constants has but its law: Gaussians that follow the total deformation "
+            "and the affine motion of their particles, and the initial motion that the identification fitted. Both "
+            "laws are fitted on the grid of the prediction, so that both compensate its error.",
+        ),
     }
 
     def fit_inputs(self, case: Case) -> Files:

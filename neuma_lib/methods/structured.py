@@ -6,7 +6,15 @@ from neuma_lib.config.motion import WithPrior
 from neuma_lib.config.structured import StructuredConfig
 from neuma_lib.config.training import TrainingConfig
 from neuma_lib.errors import InputError
-from neuma_lib.methods.base import Case, Files, Method, Preset, friction_options, training_inputs
+from neuma_lib.methods.base import (
+    AS_IDENTIFIED,
+    Case,
+    Files,
+    Method,
+    Preset,
+    friction_options,
+    training_inputs,
+)
 
 IDENTIFIED = "identified"
 
@@ -27,9 +35,7 @@ class Structured(Method):
             {
                 "prior": IDENTIFIED,
                 "rank": None,
-                "covariance_from": "total",
-                "gaussian_motion": "affine",
-                "start": "identified",
+                **AS_IDENTIFIED,
                 "iterations": 16,
                 "lr_elastic": 0.02,
                 "lr_plastic": 0.04,

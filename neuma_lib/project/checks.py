@@ -29,7 +29,7 @@ from neuma_lib.mechanics.catalogue import (
 )
 from neuma_lib.project.capture_scenes import checked_capture
 from neuma_lib.project.consistency import prior_errors
-from neuma_lib.project.random_scenes import LETTER, SHAPES, Proportions, flight
+from neuma_lib.project.random_scenes import LETTER, SHAPES, Proportions, flight, rotation_matrix
 from neuma_lib.project.settings import Config
 
 ROUND_OFF = 1e-6
@@ -83,6 +83,8 @@ def _laws(settings: Config) -> Iterator[tuple[str, dict[str, Any]]]:
     for name, scene in settings.scenes.items():
         if scene.law is not None and name not in drawn:
             yield f"scenes.{name}.law", scene.law.plain()
+        for key, body in scene.bodies.items():
+            yield f"scenes.{name}.bodies.{key}.law", body.law.plain()
     for name, law in settings.priors.laws.items():
         yield f"priors.laws.{name}", law.plain()
     for name, law in settings.identify.families.items():
@@ -117,10 +119,12 @@ def _scene_problems(settings: Config, own_captures: bool = False) -> Iterator[st
         if own_captures:
             yield from map(str, prior_errors(settings, name))
         yield from _mesh_problems(*settings.colliders(name))
-        if scene.has_truth:
+        if scene.has_truth or scene.bodies:
             truth = settings.scene_truth(name)
-            yield from _start_problems(where, plain, scene.dt, world["grid"], *settings.colliders(name))
-            yield from _courant_problem(f"{where}.law", plain["law"], plain["density"], truth.grid, truth.dt)
+            for body in settings.scene_bodies(name):
+                own = f"{where}.bodies.{body['name']}" if scene.bodies else where
+                yield from _start_problems(own, body, scene.dt, world["grid"], *settings.colliders(name))
+                yield from _courant_problem(f"{own}.law", body["law"], body["density"], truth.grid, truth.dt)
         if scene.splat:
             reach = plain["size"] * math.sqrt(3) / 2
             yield from _speed_problem(where, plain, reach, scene.dt, world["grid"])
@@ -186,6 +190,8 @@ def _start_problems(
         return
     size = body["size"] or proportions.size
     half = size * np.array(proportions.sides) / 2
+    if any(body.get("rotation", ())):  # of the ellipsoid in the turned box, which the body about fills
+        half = np.sqrt((rotation_matrix(body["rotation"]) ** 2) @ half**2)
     middle = np.array([body["center"][0], body["height"], body["center"][1]])
     for axis, key, low, high in zip("xyz", ("center", "height", "center"), middle - half, middle + half):
         if low < -ROUND_OFF or high > 1 + ROUND_OFF:

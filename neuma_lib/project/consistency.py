@@ -57,6 +57,10 @@ def _section_errors(settings: Config, root: str | Path) -> Iterator[InputError]:
         if name not in known:
             yield InputError(where, f"no {kind} '{name}'{hint(name, known)}")
     for name, experiment in settings.experiments.items():
+        for k, body in enumerate(experiment.bodies):
+            if body.scene in settings.scenes and settings.scenes[body.scene].bodies:
+                problem = f"'{body.scene}' has several bodies, and an experiment needs the law of one"
+                yield InputError(f"experiments.{name}.bodies.{k}.scene", problem, "Name another scene")
         if all(body.scene in settings.scenes for body in experiment.bodies):
             yield from _raised_by(settings.experiment_truth, name)
     yield from _sampling_errors(settings)
@@ -142,6 +146,8 @@ def _video_errors(settings: Config, name: str) -> Iterator[InputError]:
             yield InputError(where, f"'{video}' is listed twice", "The scene's own video always counts")
         elif supplied is not None and supplied == scene.images.dynamic:
             yield InputError(where, f"'{video}' has the same video, {supplied}", "Give it images.dynamic")
+        if other.bodies:
+            yield InputError(where, f"'{video}' has several bodies", "Name scenes of one body")
         if other.videos:
             yield InputError(where, f"'{video}' lists videos itself", "List all in one of the two scenes")
         differing = [key for key in SHARED_BY_VIDEOS if getattr(other, key) != getattr(scene, key)]

@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 
 from neuma_lib.config.variants import replicate_folder
+from neuma_lib.errors import InputError
 from neuma_lib.project.settings import Config
 
 FIELD = "pac_nerf/field.safetensors"
@@ -28,6 +29,12 @@ SEEDS_OF = {
 def result_path(settings: Config, name: str, file: str) -> str:
     """Path of a file of a scene or experiment in a replicate."""
     results, (base, seeds) = results_root(settings), settings.replicate(name)
+    if base in settings.scenes and settings.scenes[base].bodies:
+        raise InputError(
+            f"scenes.{base}.bodies",
+            "several bodies are simulated and rendered, but not reconstructed",
+            f"Request files of {settings.data_root.rstrip('/')}/{base}",
+        )
     if base in settings.scenes:
         seeds_used = SEEDS_OF[re.sub("[+]views=[0-9,]+", "", file)]
         return f"{results}/{replicate_folder(base, seeds, seeds_used)}/{file}"

@@ -364,12 +364,18 @@ def flight(
         positions of its centre (T, 3) [m], and its three half axes as columns (T, 3, 3) [m].
     """
     proportions = SHAPES[scene["shape"]]
-    half, offset = size * np.array(proportions.sides) / 2, size * np.array(proportions.mass_centre)
+    R = rotation_matrix(scene.get("rotation", (0.0, 0.0, 0.0)))
+    half, offset = size * np.array(proportions.sides) / 2, R @ (size * np.array(proportions.mass_centre))
     middle = np.array([scene["center"][0], scene["height"], scene["center"][1]])
     t = np.linspace(0, duration, MOMENTS + 1)[:, None]
     turned = _rotations(np.array(scene["spin"]), t[:, 0])
     path = middle + offset + t * np.array(scene["velocity"]) + t**2 / 2 * np.array(gravity)
-    return path - turned @ offset, turned * half
+    return path - turned @ offset, turned @ R * half
+
+
+def rotation_matrix(vector: Sequence[float]) -> np.ndarray:
+    """Rotation (3, 3) of a rotation vector [rad]."""
+    return _rotations(np.array(vector), np.ones(1))[0]
 
 
 def _rotations(spin: np.ndarray, t: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, Literal
 
 from pydantic import Field
@@ -26,7 +27,7 @@ from neuma_lib.config.next import NextConfig
 from neuma_lib.config.obstacles import ColliderConfig
 from neuma_lib.config.photographs import PhotographsConfig
 from neuma_lib.config.priors import PriorsConfig
-from neuma_lib.config.scenes import SceneConfig
+from neuma_lib.config.scenes import PairConfig, SceneConfig
 from neuma_lib.config.simulation import GRAVITY, SimulationConfig
 from neuma_lib.config.specimens import SpecimenConfig
 from neuma_lib.config.structured import StructuredConfig
@@ -42,7 +43,7 @@ from neuma_lib.methods.spring_gaus.options import SpringsConfig
 from neuma_lib.project.methods import PresetConfig
 from neuma_lib.project.random_scenes import RandomConfig
 
-NO_TRUTH = "the true law and motion of a captured object or a splat are unknown"
+NO_TRUTH = "the true law and motion of a captured object, a splat, or each of several bodies are unknown"
 
 
 class Config(Section):
@@ -140,9 +141,11 @@ class Config(Section):
         for body in self.experiment(name).bodies:
             scene = self.scene(body.scene).plain()
             keys = ("shape", "size", "height", "center", "velocity", "spin", "density", "law", "appearance")
+            rotation = scene["rotation"] if body.shape is None else [0.0, 0.0, 0.0]
             own = {key: value for key, value in body.plain().items() if value is not None}
             own |= {"size": body.size} if body.shape is not None else {}
-            bodies.append({**{key: scene[key] for key in keys}, **own, "reconstructed": body.shape is None})
+            whole = {**{key: scene[key] for key in keys}, "rotation": rotation, **own}
+            bodies.append({**whole, "reconstructed": body.shape is None})
         return bodies
 
     def experiment_dt(self, name: str) -> float:
@@ -169,7 +172,17 @@ class Config(Section):
         plain = {key: [each.arguments() for each in entries] for key, entries in lists.items() if entries}
         friction = self.scenes[experiment.bodies[0].scene if experiment else base].friction
         plain |= {} if friction is None else {"boundary": friction}
-        return plain | ({"contact": "particles"} if plain.keys() & {"colliders", "boundary"} else {})
+        scene = None if experiment else self.scenes[base]
+        if scene and scene.pairs:
+            plain["pairs"] = [_pair_arguments(pair, list(scene.bodies)) for pair in scene.pairs]
+        touches = plain.keys() & {"colliders", "boundary"} or scene and scene.bodies
+        return plain | ({"contact": "particles"} if touches else {})
+
+    def scene_bodies(self, name: str) -> list[dict[str, Any]]:
+        """Plain descriptions of the bodies of a scene: those of several with their ``name``, or the scene itself."""
+        scene = self.scene(name)
+        several = [{"name": key, **body.plain()} for key, body in scene.bodies.items()]
+        return several or [scene.plain()]
 
     def colliders(self, name: str) -> tuple[str, tuple[ColliderConfig, ...]]:
         """Path of the key with the colliders of a scene or an experiment, and them."""
@@ -233,3 +246,10 @@ class Config(Section):
         if scene.frames is None and scene.images.stride is not None:
             return tuple(range(0, steps + 1, scene.images.stride))
         return scene.frames or self.dataset.frame_steps(steps)
+
+
+def _pair_arguments(pair: PairConfig, bodies: Sequence[str]) -> dict[str, Any]:
+    """Plain arguments of `neuma_lib.sim.bodies.Pair`, with the indices of the bodies in ascending order."""
+    first, second = sorted(bodies.index(name) for name in pair.bodies)
+    friction = {} if pair.friction is None else {"friction": pair.friction}
+    return {"first": first, "second": second, **friction}

@@ -92,6 +92,10 @@ class NativeTransfers:
         self.adjoint = {elastic: self._adjoints(elastic) for elastic in (False, True)}
         self._steps["adjoint"] = LaunchSequence(self.adjoint[False])
 
+    def tracer_launch(self, first_of: Tensor, positions: wp.array) -> wp.Launch:
+        """See `Workspace.tracer_launch`."""
+        return self._ws.record(self._kernels.advect_tracers, 1, self.grids, first_of, positions)
+
     def run(self, name: str, step: int) -> None:
         """Run the launches of that name for a step."""
         self._steps[name].run(step)

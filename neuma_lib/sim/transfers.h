@@ -354,6 +354,38 @@
         for (int l = 0; l < (all_fine ? 0 : used); ++l) fault(begin + l, copy);
     }
 
+// x += dt v for tracers, as `kernels.advect_tracers`. Those of a block belong to one body.
+//// advect
+    Rows all = {};
+    for (int begin = 0, used; begin < x.shape[0]; begin += used) {
+        const int* const first = (const int*)first_of.data + begin;
+        int own = 0;
+        for (int k = 1; k < c.ranges; ++k) own = first[0] >= c.starts[k] ? k : own;
+        for (used = 1; used < 16 && begin + used < x.shape[0] && first[used] == first[0];) ++used;
+        Real* const p = (Real*)x.data + 3 * begin;
+        prepare(p, used, c.body_of[own]);
+        for (int l = 0; l < used; ++l) {
+            Row total;
+            for (int i = 0; i < 3; ++i)
+                for (int j = 0; j < 3; ++j) {
+                    const Row row = *(const Row*)((const Four*)grid_v.data + block.first[l] + (i * n + j) * n);
+                    add(i + j == 0, total, block.w_ij[3 * i + j][l], row);
+                }
+            *(Row*)all[l] = total;
+        }
+        Row v_p[4], place[3];
+        load_lanes(p, used, place);
+        add_nodes(all, block.w[2], v_p);
+        const Row none = {};
+        for (int k = 0; k < 3; ++k) {
+            Row moved = place[k] + dt * (v_p[k] / v_p[3]);
+            moved = moved < c.clamp_high ? moved : none + c.clamp_high;
+            moved = moved > c.clamp_low ? moved : none + c.clamp_low;
+            place[k] = v_p[3] > none ? moved : place[k];
+        }
+        store_lanes(p, used, place);
+    }
+
 //// trial
     for (int begin = 0, used; begin < c.copies * c.particles; begin += used) {
         used = c.copies * c.particles - begin < 16 ? c.copies * c.particles - begin : 16;

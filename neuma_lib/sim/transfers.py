@@ -85,6 +85,11 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         faults: wp.array2d(dtype=wp.int64),
     ): ...  # fmt: skip
 
+    @wp.func_native(_native(dtype, "lanes", "block", "advect"))
+    def advect_loop(
+        c: GridConstants, grid_v: wp.array(dtype=vec4), first_of: wp.array(dtype=wp.int32), x: wp.array(dtype=vec3)
+    ): ...  # fmt: skip
+
     @wp.func_native(_native(dtype, "lanes", "trial"))
     def trial_loop(
         c: GridConstants, C_after: wp.array(dtype=mat33), F: wp.array(dtype=mat33), F_trial: wp.array(dtype=mat33)
@@ -268,6 +273,16 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         g2p_loop(
             c, step, mass_now, grids[1], x[now], F[now], x[after], v[after], C[after], F_trial[cached], faults
         )
+
+    @kernel
+    def advect_tracers(
+        c: GridConstants,
+        grids: wp.array2d(dtype=vec4),
+        first_of: wp.array(dtype=wp.int32),
+        x: wp.array(dtype=vec3),
+    ):
+        """As `kernels.advect_tracers`."""
+        advect_loop(c, grids[1], first_of, x)
 
     @kernel
     def trial_deformation(
@@ -464,6 +479,7 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         p2g=p2g,
         grid_update=grid_update,
         g2p=g2p,
+        advect_tracers=advect_tracers,
         trial_deformation=trial_deformation,
         move_held=move_held,
         g2p_adjoint=g2p_adjoint,

@@ -355,12 +355,14 @@ class Workspace:
         starts = np.cumsum([0, *(count for count, _ in self.size.ranges)])[: len(bodies)]
         first_of = self.buffer((len(tracers),), dtype=torch.int32)
         first_of.copy_(torch.from_numpy(np.repeat(starts, bodies)))
+        if self.native:
+            return self.native.tracer_launch(first_of, positions)
         rows = self._rows(self.grid_v)
         return self.record(self._deformation.advect_tracers, len(tracers), 0, rows, first_of, positions)
 
     def move_tracers(self, launch: wp.Launch, step: int) -> None:
         """Advect tracers by the node velocities of a step."""
-        _run(launch, 0 if self.native else self.cached_at(step))
+        _run(launch, *([] if self.native else [self.cached_at(step)]))
 
     def transfer_adjoint(self, step: int) -> None:
         """From gradients of the state after a step and of F_trial to those of the state before it and of tau.

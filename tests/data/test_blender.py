@@ -18,7 +18,7 @@ from neuma_lib.data.blender import worker
 from neuma_lib.data.blender.appearance import colors_at, smooth_noise
 from neuma_lib.data.blender.bodies import make_body
 from neuma_lib.data.blender.libraries import explain_import_error
-from neuma_lib.data.blender.scene import Surface, render_dynamic, render_static
+from neuma_lib.data.blender.scene import Several, Surface, render_dynamic, render_static
 from neuma_lib.geometry import shapes
 from neuma_lib.geometry.obstacles import obstacles
 from neuma_lib.geometry.volume import sample_volume
@@ -358,3 +358,28 @@ def test_a_moving_obstacle_hides_the_body_in_its_mask(tmp_path):
     # the colours show the wall, which is grey and darker than the white behind it
     wall = half[32, int(edge) - 8, :3].astype(int)
     assert np.ptp(wall) < 40 and wall.max() < 200 and (half[0, -1, :3] == 255).all()
+
+
+@needs_blender
+def test_labels_are_the_visible_objects(tmp_path):
+    """Of two squares, the front one covers the lower half of the other. Borders are where their edges project."""
+
+    def square(y, z):
+        corners = [(0.4, y), (0.6, y), (0.6, y + 0.2), (0.4, y + 0.2)]
+        vertices = np.array([(x, y, z) for x, y in corners])
+        return Surface(vertices[None], np.array([[0, 1, 2], [0, 2, 3]]), np.full((4, 3), 0.5))
+
+    pile = Several([square(0.4, 0.4), square(0.3, 0.6)])
+    views = cameras.video_views(pile.points, 1, 64, 64)
+    render_dynamic(pile, views, [0], 1.0, tmp_path, 8)
+    (frame,) = json.loads((tmp_path / "transforms.json").read_text())["frames"]
+    labels = np.array(Image.open(tmp_path / frame["label_path"]))
+    mask = read_image_set(tmp_path / "transforms.json").images[0, ..., 3]
+    np.testing.assert_array_equal(labels > 0, mask > 127)
+    column = int(views.project(np.array([[0.5, 0.5, 0.5]]))[0, 0, 0])
+    heights = [((0.5, 0.6, 0.4), 0, 1), ((0.5, 0.5, 0.6), 1, 2), ((0.5, 0.3, 0.6), 2, 0)]
+    for edge, above, below in heights:
+        row = views.project(np.array([edge]))[0, 0, 1]
+        assert labels[int(row - 1.5), column] == above and labels[int(row + 1.5), column] == below
+    render_dynamic(pile.bodies[0], views, [0], 1.0, tmp_path / "one", 8)
+    assert not (tmp_path / "one" / "labels").exists()

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+import trimesh
 import yaml
 
 from neuma_lib.coupling.bodies import coloured_solid, join
@@ -24,6 +26,7 @@ from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.density import density_at
 from neuma_lib.project import cases
 from neuma_lib.project.loading import load, merged
+from neuma_lib.sim.bodies import Pair
 from neuma_lib.sim.model import MPM
 from neuma_lib.sim.state import State
 from neuma_lib.splatting.cameras import Cameras
@@ -145,6 +148,35 @@ def test_colliding_bodies_of_different_mass_exchange_momentum():
     # Tracers fill both bodies, equally densely.
     left = float((truth.tracers[0, :, 0] < 0.5).float().mean())
     assert left == pytest.approx(0.5, abs=0.04)
+
+
+def test_separate_bodies_of_a_truth_keep_their_tracers():
+    """Of boxes that touch and slide along each other without friction, each tracer moves as its body.
+
+    Their edges, which meet at the start, slow them down by a tenth. As one body the boxes stick.
+    """
+    boxes = []
+    for x in (0.4, 0.6):
+        boxes.append(trimesh.creation.box((0.2, 0.2, 0.2)).apply_translation((x, 0.5, 0.5)))
+    bodies = [
+        TrueBody(mesh, analytic_law(JELLY), (0.0, speed, 0.0)) for mesh, speed in zip(boxes, (0.5, -0.5))
+    ]
+    model = MPM(16, 1e-3, gravity=(0.0, 0.0, 0.0), pairs=(Pair(0, 1, 0.0),))
+    options = dict(particles=500, tracers=400, seed=1)
+    truth = simulate_ground_truth(model, bodies, (0, 100), separate=True, **options)
+    for owner, points in ((truth.body, truth.path.x), (truth.tracer_body, truth.tracers)):
+        assert torch.equal(owner, (points[0, :, 0] > 0.5).long())
+        moved = points[-1] - points[0]
+        expected = torch.where(owner == 0, 0.05, -0.05)
+        assert (moved[:, 1] - expected).abs().max() < 0.025
+        for body, sign in enumerate((1, -1)):
+            assert float(moved[owner == body, 1].mean()) == pytest.approx(sign * 0.05, rel=0.2)
+    again = truth.tracers_again
+    torch.testing.assert_close(
+        (again[-1] - again[0])[:, 1].sign(), torch.where(again[0, :, 0] < 0.5, 1.0, -1.0), rtol=0, atol=0
+    )
+    stuck = simulate_ground_truth(replace(model, pairs=()), bodies, (0, 100), **options)
+    assert (stuck.path.x[-1] - truth.path.x[-1]).abs().max() > 0.02
 
 
 def test_a_converged_truth_has_eight_particles_in_a_cell_and_its_file_fewer():

@@ -300,14 +300,23 @@ def test_candidates_are_ranked_and_written(alone):
     """Launches and cameras together; the record reads back, and progress reaches the end."""
     chosen, calls = settings(), []
     fit = replace(alone.best, covariance=400 * alone.best.covariance)
-    lab = NextConfig(candidates=10)
+    lab = NextConfig(candidates=9)
     choice = choose_next(fit, [experiment()], chosen, lab, progress=lambda *each: calls.append(each))
-    assert calls[-1] == (10, 10) and len(choice.options) + choice.failed == 10
+    assert calls[-1] == (9, 9) and len(choice.options) + choice.failed == 9
     assert {option.kind for option in choice.options} == {"launch", "camera"}
+    assert {"rotation" in option.settings for option in choice.options if option.kind == "launch"} == {
+        False,
+        True,
+    }
     after = [option.after for option in choice.options]
     assert after == sorted(after) and after[0] < choice.before and choice.useful
     written = choice.as_dict()
     assert written["candidates"][0]["expected"] == stds(choice.options[0].forecast.fit, chosen)
+    for box, room in zip(written["candidates"], choice.as_dict(scale=2.0)["candidates"], strict=True):
+        if box["kind"] == "launch":
+            assert box["settings"]["velocity"] == [2 * v for v in room["settings"]["velocity"]]
+            assert box["settings"]["height"] == 2 * room["settings"]["height"]
+            assert box["settings"]["spin"] == room["settings"]["spin"]
 
 
 def test_a_record_is_read_and_a_missing_family_refused(alone):
@@ -317,3 +326,27 @@ def test_a_record_is_read_and_a_missing_family_refused(alone):
     with refused("identified.json"):
         read_fit(record, settings(other=law("neo_hookean")))
     assert read_rivals(record, settings(), fit, 2) == []
+
+
+def linearised(values, covariance=None, spec=HENCKY):
+    family = Family("tested", spec)
+    each = experiment(std=(0.0,) * 6).residuals(settings())
+    assert each.observe(Candidate(family.law_spec(values), np.zeros(NUISANCES)))
+    return FamilyRun(family, [each], [len(FRAMES)], settings()).linearise_at(values, covariance).curvature
+
+
+def test_narrow_differences_are_derivatives():
+    """With a tiny covariance along the constants, differences have the width of derivatives, 4 %, on the side with the
+    smaller change. For E, whose images change smoothly, the sides differ by less than a third."""
+    values = {"E": 3e4, "nu": 0.3}
+    derivatives, narrow = (np.diag(linearised(values, each)) for each in (None, np.diag([1e-8, 2e-8])))
+    assert (narrow <= derivatives * (1 + 1e-9)).all() and narrow[0] > derivatives[0] * 2 / 3
+
+
+def test_a_plateau_has_less_information_than_its_edge():
+    """A yield stress just below the largest stress of the launch: lower ones change the images, higher ones do not."""
+    plastic = law("hencky", "von_mises", yield_stress=12e3)
+    values = {"E": 3e4, "nu": 0.3, "yield_stress": 12e3}
+    edge = linearised(values, spec=plastic)[2, 2]
+    wide = linearised(values, np.diag([1e-8, 1e-8, 1.0]), plastic)[2, 2]
+    assert wide < 0.1 * edge

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 from scipy import ndimage
+from scipy.spatial.transform import Rotation
 
 from neuma_lib.geometry import shapes
 from neuma_lib.geometry.skinning import carry, skinning_matrix
@@ -128,3 +129,17 @@ def test_skinning_follows_a_bend():
 def test_skinning_needs_particles():
     with refused("skinning: particles"):
         skinning_matrix(np.zeros((3, 3)), np.zeros((4, 3)))
+
+
+def test_a_turned_solid_is_placed_and_keeps_its_parts():
+    """Its bounding box is centred as before, its volume is the same, and each vertex belongs to the same part."""
+    rotation = (0.4, -1.1, 0.7)
+    rest = shapes.place("duck", 0.3, 0.42, (0.4, 0.6), 40)
+    turned = shapes.place("duck", 0.3, 0.42, (0.4, 0.6), 40, rotation)
+    assert turned.bounds.mean(axis=0) == pytest.approx([0.4, 0.42, 0.6])
+    assert turned.volume == pytest.approx(rest.volume)
+    R = Rotation.from_rotvec(rotation).as_matrix()
+    edges = [mesh.vertices[1:] - mesh.vertices[:1] for mesh in (rest, turned)]
+    assert edges[1] == pytest.approx(edges[0] @ R.T)
+    nominal = [shapes.to_nominal(mesh, mesh.vertices)[1] for mesh in (rest, turned)]
+    assert nominal[1] == pytest.approx(nominal[0], abs=1e-9)

@@ -24,6 +24,7 @@ from neuma_lib.methods.base import ModelSource, Problem, method_of
 from neuma_lib.methods.model import LawOnGrid
 from neuma_lib.methods.prior import prior_source
 from neuma_lib.methods.structured import Structured, StructuredOptions
+from neuma_lib.project import cases
 from neuma_lib.sim.model import MPM, consecutive
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
@@ -100,6 +101,23 @@ def test_neuma_is_a_prior_with_an_adaptor(tmp_path, stable):
     model = loaded("neuma", files)
     assert torch.equal(bent(model.law), bent(law)) and model.stable is stable
     assert not torch.equal(bent(model.law), bent(load_law(files["prior"])))
+
+
+def test_neuma_may_have_the_inputs_of_the_constants(changed):
+    """All rows that start as identified have the same options of motion. NeuMA's training is otherwise the same."""
+    settings = changed()
+    shared = ("covariance_from", "gaussian_motion", "start", "views", "particle_source", "assumed_density")
+
+    def options(name):
+        return cases.case(settings, "ClayCat", name).options.plain()
+
+    constants, plain, same = map(options, ("constants", "neuma", "neuma_same_inputs"))
+    assert {key: same[key] for key in shared} == {key: constants[key] for key in shared}
+    assert {key for key in same if same[key] != plain[key]} == {"covariance_from", "gaussian_motion", "start"}
+    assert all(options("neuma_structured")[key] == constants[key] for key in shared)
+    case = cases.case(settings, "ClayCat", "neuma_same_inputs")
+    assert case.method.fit_inputs(case)["velocity"] == case.result("identified.json")
+    assert case.method.start_file(case) == case.result("identified.json")
 
 
 def test_a_structured_law_is_complete_in_its_file(tmp_path):

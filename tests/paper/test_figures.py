@@ -22,6 +22,7 @@ from matplotlib.text import Text
 from matplotlib.textpath import TextPath
 from PIL import Image
 
+from neuma_lib.evaluation.calibration import LEVELS
 from neuma_lib.evaluation.material_point import Visited, largest_shear_stress, sheared, uniaxial, yielding
 from neuma_lib.evaluation.plotting import style
 from neuma_lib.evaluation.plotting.rendering import cropped, evenly, frontal, magnified
@@ -200,6 +201,16 @@ DATA = {
     "material_response": lambda: {
         "titles": {law: built_in_presets().get(law, {"title": law})["title"] for law in RESPONDING},
         "scenes": {scene: response() for scene in SCENES},
+    },
+    "reliability": lambda: {
+        quantity: {
+            method: {
+                f"covered{end}": [min(1, max(0, scale * level + shift)) for level in LEVELS]
+                for end, shift in (("", 0), ("_low", -0.1), ("_high", 0.1))
+            }
+            for method, scale in (("calibrated", 1), ("Laplace", 0.1), ("fixed 10 %", 0.6))
+        }
+        for quantity in ("constants", "contact_friction", "another launch")
     },
     "random_scenes": lambda: {
         "titles": ["NCLaw", "NeuMA"],

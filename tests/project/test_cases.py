@@ -222,7 +222,7 @@ def test_what_a_method_draws_names_its_run(loaded):
     runs = {name: cases.run_folder(loaded, folder, name).partition("/")[0] for name in loaded.methods}
     drawn = {name for name, run in runs.items() if run == folder}
     assert drawn == {"neuma", "neuma_particle_supervision", "neuma_without_binding", "neuma_without_binding_own",
-                     "neuma_structured"}  # fmt: skip
+                     "neuma_same_inputs", "neuma_structured"}  # fmt: skip
 
 
 def test_every_method_states_its_files_without_torch(loaded):

@@ -20,7 +20,7 @@ from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.paper.random_scenes import failure, random_table
 from neuma_lib.project import loading
-from neuma_lib.project.random_scenes import DENSITY, FLAWS, LETTER, SHAPES, draw_scenes
+from neuma_lib.project.random_scenes import DENSITY, FLAWS, LETTER, SHAPES, draw_scenes, flight
 from neuma_lib.sim.model import MPM
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
@@ -356,3 +356,13 @@ def test_failures_are_described():
     assert failure({"diverged": None, "stable": True}) is None
     assert failure({"diverged": None, "stable": False}) == "its training diverged"
     assert failure({"diverged": broken, "stable": True}) == "a particle became non-finite in step 8"
+
+
+def test_a_turned_body_flies_as_a_turned_box():
+    """A quarter turn about z exchanges width and height, also of the offset of the centre of mass."""
+    scene = {"shape": "pawn", "center": [0.5, 0.5], "height": 0.5, "velocity": [0, 0, 0], "spin": [0, 0, 0]}
+    middle, upright = flight(scene, 0.4, (0.0, -9.8, 0.0), 0.1)
+    lying_middle, lying = flight({**scene, "rotation": [0, 0, np.pi / 2]}, 0.4, (0.0, -9.8, 0.0), 0.1)
+    half = np.abs(upright[0]).sum(axis=1)
+    assert np.abs(lying[0]).sum(axis=1) == pytest.approx(half[[1, 0, 2]])
+    assert lying_middle == pytest.approx(middle)

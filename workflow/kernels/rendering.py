@@ -14,16 +14,17 @@ INTRINSICS = [[16.0, 0.0, 8.0], [0.0, 16.0, 8.0], [0.0, 0.0, 1.0]]
 
 
 def compile_kernels(device: torch.device) -> None:
-    """The loss of one small image of four Gaussians, forward and backward, in both precisions."""
-    for dtype in (torch.float32, torch.float64):
-        kind = dict(dtype=dtype, device=device)
-        x0 = torch.tensor([[0.1, 0, 2], [0, 0.1, 2], [-0.1, 0, 2], [0, -0.1, 2]], **kind)
-        eye = torch.eye(3, **kind).expand(4, 3, 3)
-        x, F = x0[None].clone().requires_grad_(), eye[None].clone().requires_grad_()
-        means, covars = deform(x0, 0.05**2 * eye, Binding.identity(4, x0), x0, x, F)
-        opacities, sh = torch.full((4,), 0.5, **kind), torch.zeros(4, 4, 3, **kind, requires_grad=True)
-        camera = torch.eye(4, **kind)[None], torch.tensor([INTRINSICS], **kind)
-        scene = (means, covars, opacities, sh, *camera, SIZE, SIZE)
-        observed = torch.zeros(1, 1, SIZE, SIZE, 4, dtype=torch.uint8, device=device)
-        compared = mean_squared_error(rasterize(*scene)[0], observed)
-        (compared + rasterized_error(*scene, observed)).sum().backward()
+    """The loss of one small image of four Gaussians, forward and backward."""
+    x0 = torch.tensor([[0.1, 0, 2], [0, 0.1, 2], [-0.1, 0, 2], [0, -0.1, 2]], device=device)
+    eye = torch.eye(3, device=device).expand(4, 3, 3)
+    x, F = x0[None].clone().requires_grad_(), eye[None].clone().requires_grad_()
+    means, covars = deform(x0, 0.05**2 * eye, Binding.identity(4, x0), x0, x, F)
+    opacities, sh = (
+        torch.full((4,), 0.5, device=device),
+        torch.zeros(4, 4, 3, device=device, requires_grad=True),
+    )
+    camera = torch.eye(4, device=device)[None], torch.tensor([INTRINSICS], device=device)
+    scene = (means, covars, opacities, sh, *camera, SIZE, SIZE)
+    observed = torch.zeros(1, 1, SIZE, SIZE, 4, dtype=torch.uint8, device=device)
+    compared = mean_squared_error(rasterize(*scene)[0], observed)
+    (compared + rasterized_error(*scene, observed)).sum().backward()

@@ -57,7 +57,10 @@ rule ground_truth:
         gpu=EITHER_GPU,
         mem_mb=truth_memory,
     params:
-        bodies=body_settings("shape", "size", "height", "center", "velocity", "spin", "density", "law"),
+        bodies=body_settings(
+            "shape", "size", "height", "center", "rotation", "velocity", "spin", "density", "law"
+        ),
+        separate=has_separate_bodies,
         simulation=lambda wildcards: simulator(
             subject(wildcards), truth_settings(wildcards).dt, truth_settings(wildcards).grid
         ),
@@ -89,7 +92,7 @@ for part, part_images in (("static", SETTINGS.dataset.static), ("dynamic", SETTI
             gpu=RENDER_GPU,
             runtime=render_minutes(part),
         params:
-            scene=scene_setting("shape", "size", "height", "center", "appearance"),
+            bodies=body_settings("shape", "size", "height", "center", "rotation", "appearance"),
             moving=part == "dynamic",
             images=part_images.plain(),
             threads=BLENDER.threads,

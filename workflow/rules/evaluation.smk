@@ -15,7 +15,7 @@ rule initial_state:
     wildcard_constraints:
         scene=TRUE_SCENE,
     params:
-        scene=scene_setting("shape", "size", "height", "center", "velocity", "spin", "density"),
+        scene=scene_setting("shape", "size", "height", "center", "rotation", "velocity", "spin", "density"),
         particles=SETTINGS.geometry.particles,
     script:
         "../scripts/initial_state.py"

@@ -373,7 +373,7 @@ FIGURES = {
         },
         "params": {
             "scenes": lambda wildcards: {
-                scene: scene_setting("shape", "size", "height", "center", "appearance")(
+                scene: scene_setting("shape", "size", "height", "center", "rotation", "appearance")(
                     SimpleNamespace(scene=scene)
                 )
                 for scene in DRAWN.obstacles

@@ -58,6 +58,7 @@ rule next:
             }
         ),
         rendered=of_section(lambda scene: scene.has_truth and scene.images.dynamic is None),
+        scale=of_section(lambda scene: scene.captured.scale if scene.captured else 1.0),
         seed=SETTINGS.seed,
         exposure=exposure,
         device=SETTINGS.device,

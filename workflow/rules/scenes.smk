@@ -103,6 +103,8 @@ def origin_of(part, scene):
     A truth is always simulated, also where the user supplies the video. All of a capture is 'captured'. A splat has
     neither images nor a truth.
     """
+    if SETTINGS.scenes[scene].bodies:
+        return "made"
     if not SETTINGS.scenes[scene].has_truth:
         return "captured" if SETTINGS.scenes[scene].captured else "none"
     if getattr(SETTINGS.scenes[scene].images, "dynamic" if part == "truth" else part):
@@ -201,11 +203,20 @@ def densities_of(scenes):
 def body_settings(*keys):
     """A function of wildcards: the named settings of the bodies of a scene or experiment."""
     return by_subject(
-        lambda scene: [scene_setting(*keys)(SimpleNamespace(scene=scene))],
+        lambda scene: (
+            [{key: body[key] for key in ("name", *keys)} for body in SETTINGS.scene_bodies(scene)]
+            if SETTINGS.scene(scene).bodies
+            else [scene_setting(*keys)(SimpleNamespace(scene=scene))]
+        ),
         lambda experiment: [
             {key: body[key] for key in keys} for body in SETTINGS.experiment_bodies(experiment)
         ],
     )
+
+
+def has_separate_bodies(wildcards):
+    """Whether the bodies of a scene touch each other with friction. Those of an experiment stick."""
+    return by_subject(lambda scene: bool(SETTINGS.scene(scene).bodies), lambda experiment: False)(wildcards)
 
 
 def solid_meshes(every=True):
@@ -213,7 +224,7 @@ def solid_meshes(every=True):
 
     Without those that an experiment takes from reconstructions, if not ``every``.
     """
-    bodies = by_subject(lambda scene: [SETTINGS.scene(scene).plain()], SETTINGS.experiment_bodies)
+    bodies = by_subject(SETTINGS.scene_bodies, SETTINGS.experiment_bodies)
 
     @checked
     def choose(wildcards):

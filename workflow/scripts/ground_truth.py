@@ -20,7 +20,13 @@ def simulated(model, inputs, params):
     meshes = iter(listed(inputs.meshes))
     bodies = [
         TrueBody(
-            place(solid(body["shape"], meshes), body["size"], body["height"], body["center"]),
+            place(
+                solid(body["shape"], meshes),
+                body["size"],
+                body["height"],
+                body["center"],
+                rotation=body["rotation"],
+            ),
             analytic_law(body["law"], dt=model.dt),
             body["velocity"],
             body["density"],
@@ -37,6 +43,7 @@ def simulated(model, inputs, params):
         tracers=params.tracers,
         seed=params.seed,
         stored=params.stored,
+        separate=params.separate,
         device=choose_device(params.device),
     )
 
@@ -58,6 +65,8 @@ def main(inputs, output, params, run) -> None:
         "time": np.asarray(params.frames) * params.dt,
         **{name: getattr(truth, name).numpy() for name in ("vol0", "mass", "tracers", "tracers_again")},
     }
+    if params.separate:
+        arrays |= {"body": truth.body.numpy(), "tracer_body": truth.tracer_body.numpy()}
     write_arrays(
         output.truth,
         arrays,

@@ -23,7 +23,7 @@ def main(inputs, output, params, run) -> None:
     shape = solid(scene["shape"], iter(listed(inputs.meshes)))
     mesh, true_mesh = (
         read_mesh(inputs.mesh),
-        place(shape, scene["size"], scene["height"], scene["center"]),
+        place(shape, scene["size"], scene["height"], scene["center"], rotation=scene["rotation"]),
     )
     axes, spin = np.asarray(velocity["camera_axes"]), np.asarray(scene["spin"])
     truth, _ = read_arrays(inputs.truth, required=("x", "mass"), only=("x", "mass"))

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from neuma_lib.config.blender import AppearanceConfig, ImagesConfig
 from neuma_lib.data.blender.bodies import make_body
-from neuma_lib.data.blender.scene import render_dynamic, render_static
+from neuma_lib.data.blender.scene import Several, render_dynamic, render_static
 from neuma_lib.errors import InputError
 from neuma_lib.geometry.obstacles import obstacles, sees_all
 from neuma_lib.geometry.shapes import place
@@ -21,15 +21,20 @@ MIN_VIEWS = 8
 
 
 def main(inputs, output, params, run) -> None:
-    scene, images = params.scene, ImagesConfig(**params.images)
+    images, owners = ImagesConfig(**params.images), ("body", "tracer_body")
     names = ("x", "tracers", "frames")
-    arrays, attributes = read_arrays(inputs.truth, only=names, required=names)
-    steps = arrays["frames"].tolist() if params.moving else [0]
-    mesh = place(
-        solid(scene["shape"], iter(listed(inputs.meshes))), scene["size"], scene["height"], scene["center"]
-    )
-    look = AppearanceConfig(**scene["appearance"])
-    body = make_body(mesh, look, arrays["x"][: len(steps)], arrays["tracers"][: len(steps)])
+    arrays, attributes = read_arrays(inputs.truth, only=(*names, *owners), required=names)
+    steps, meshes = arrays["frames"].tolist() if params.moving else [0], iter(listed(inputs.meshes))
+    made = []
+    for k, own in enumerate(params.bodies):
+        mesh = place(
+            solid(own["shape"], meshes), own["size"], own["height"], own["center"], rotation=own["rotation"]
+        )
+        points = [arrays[name][: len(steps)] for name in ("x", "tracers")]
+        if len(params.bodies) > 1:
+            points = [values[:, arrays[owner] == k] for values, owner in zip(points, owners, strict=True)]
+        made.append(make_body(mesh, AppearanceConfig(**own["appearance"]), *points))
+    body = made[0] if len(made) == 1 else Several(made)
     viewpoints = video_views if params.moving else static_views
     views = viewpoints(body.points, images.views, images.width, images.height)
     folder = Path(output.transforms).parent

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import bpy
@@ -184,6 +185,12 @@ class Obstacles:
         """Whether obstacles are transparent, and hide the body nevertheless."""
         for each in self.objects:
             each.is_holdout = transparent
+
+
+def cut_out_others(bodies: Sequence[Body], shown: int | None) -> None:
+    """Make all bodies but one transparent, which hide it nevertheless, or none."""
+    for k, body in enumerate(bodies):
+        body.object.is_holdout = shown is not None and k != shown
 
 
 class Body:

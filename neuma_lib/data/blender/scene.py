@@ -99,8 +99,36 @@ class Liquid:
         }
 
 
+@dataclass(frozen=True)
+class Several:
+    """Several objects with the same number of frames."""
+
+    bodies: Sequence[Surface | Liquid]
+
+    def __len__(self) -> int:
+        return len(self.bodies[0])
+
+    @property
+    def points(self) -> np.ndarray:
+        """Points that must be in the frame (k, 3) [m]."""
+        return np.concatenate([body.points for body in self.bodies])
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Arrays as for `Surface` of each body, whose names begin with its number."""
+        named = {
+            f"{k}_{name}": value
+            for k, body in enumerate(self.bodies)
+            for name, value in body.arrays().items()
+        }
+        return {"bodies": np.array(len(self.bodies)), **named}
+
+
+LABELS = "labels"
+"""Folder of the label images, in that of the images."""
+
+
 def render_images(
-    geometry: Surface | Liquid,
+    geometry: Surface | Liquid | Several,
     views: Views,
     shots: Sequence[tuple[int, int]],
     out_dir: str | Path,
@@ -115,7 +143,8 @@ def render_images(
     """Render shots to RGBA PNG files.
 
     Args:
-        geometry: the object, frames 0 ... len - 1.
+        geometry: the object, or several, frames 0 ... len - 1. With several and ``matte``, images of the same names in
+            the folder `LABELS` have the number of the visible object, from 1, or 0 where they cover less than half.
         views: cameras.
         shots: (frame, camera) of each image; shots of one frame should be consecutive.
         out_dir: folder of the images, created if missing; existing images are replaced.
@@ -158,6 +187,10 @@ def render_images(
             image = Path(folder) / f"{index:05d}.png"
             if obstacles and matte:
                 _add_surroundings(image, image.with_stem(f"{image.stem}_all"))
+            if isinstance(geometry, Several) and matte:
+                (out_dir / LABELS).mkdir(exist_ok=True)
+                masks = [image.with_stem(f"{image.stem}_body{k}") for k in range(len(geometry.bodies))]
+                Image.fromarray(_labels(masks)).save(out_dir / LABELS / name)
             image.write_bytes(_pixels_only(image.read_bytes()))
             os.replace(image, out_dir / name)
 
@@ -171,6 +204,12 @@ def obstacle_arrays(obstacles: Sequence[Obstacle]) -> dict[str, np.ndarray]:
     for k, each in enumerate(obstacles):
         arrays |= {f"obstacle_{k}_vertices": each.vertices, f"obstacle_{k}_faces": each.faces}
     return arrays
+
+
+def _labels(masks: Sequence[Path]) -> np.ndarray:
+    """Number (h, w) of the object that covers each pixel most, from 1, or 0 where all together cover less than half."""
+    alpha = np.stack([np.array(Image.open(mask).convert("RGBA"))[..., 3] for mask in masks]).astype(int)
+    return np.where(alpha.sum(axis=0) > 127, 1 + alpha.argmax(axis=0), 0).astype(np.uint8)
 
 
 def _add_surroundings(image: Path, whole: Path) -> None:
@@ -233,7 +272,7 @@ def run_worker(module: str, job: Path, total: int = 0, progress: Progress | None
 
 
 def render_static(
-    geometry: Surface | Liquid,
+    geometry: Surface | Liquid | Several,
     views: Views,
     out_dir: str | Path,
     samples: int,
@@ -251,7 +290,7 @@ def render_static(
 
 
 def render_dynamic(
-    geometry: Surface | Liquid,
+    geometry: Surface | Liquid | Several,
     views: Views,
     steps: Sequence[int],
     dt: float,
@@ -299,5 +338,8 @@ def _render_set(geometry, views, shots, names, steps, times, out_dir, obstacles,
         for name, (frame, view), seen in zip(names, shots, visible, strict=True)
         if seen
     ]
+    if isinstance(geometry, Several):
+        for frame in frames:
+            frame["label_path"] = f"{LABELS}/{frame['file_path']}"
     lens = {"fl_x": views.focal, "fl_y": views.focal, "cx": views.width / 2, "cy": views.height / 2}
     write_transforms(transforms, {"w": views.width, "h": views.height, **lens}, frames)

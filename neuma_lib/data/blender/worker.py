@@ -64,13 +64,16 @@ def main(path: str) -> None:
 
     folder = Path(path).parent
     cycles.start(*(int(s) for s in job["size"]), int(job["samples"]), threads, str(job["device"]))
-    body, matte = cycles.Body(job), bool(job["matte"])
+    matte, count = bool(job["matte"]), int(job.get("bodies", 0))
+    several = [{name.removeprefix(f"{k}_"): value for name, value in job.items()} for k in range(count)]
+    bodies = [cycles.Body(own) for own in several or [job]]
     obstacles = cycles.Obstacles(job, shadows=not matte)
     camera = cycles.add_camera(float(job["focal"]), int(job["size"][0]))
     current = None
     for index, (frame, view) in enumerate(job["shots"]):
         if frame != current:
-            body.show(int(frame))
+            for body in bodies:
+                body.show(int(frame))
             obstacles.show(int(frame))
             current = frame
         cycles.place(camera, job["c2w"][view])
@@ -79,6 +82,10 @@ def main(path: str) -> None:
             cycles.render(folder / f"{index:05d}_all.png")
             obstacles.cut_out(True)
         cycles.render(folder / f"{index:05d}.png")
+        for k in range(count if matte else 0):  # the mask of a body ends where another hides it
+            cycles.cut_out_others(bodies, k)
+            cycles.render(folder / f"{index:05d}_body{k}.png")
+            cycles.cut_out_others(bodies, None)
         print(index + 1, file=report, flush=True)
     for lock in claimed:
         lock.close()

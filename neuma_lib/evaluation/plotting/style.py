@@ -54,6 +54,7 @@ METHODS = {
     "neuma_particle_supervision": Look(GREEN, "^", (0, (1, 1))),
     "neuma_without_binding": Look(VERMILION, "v", (0, (5, 1, 1, 1))),
     "neuma_without_adaptor": Look(PURPLE, "D", (0, (2, 1))),
+    "neuma_same_inputs": Look("#0f0f87", ">", (0, (3, 1, 1, 1))),
     "true_law": Look("#5b3a1e", "d", (0, (1, 2))),
     "constants": Look("#330dcc", "p", (0, (6, 2, 2, 2))),
     "neuma_structured": Look("#a5005a", "h", (0, (8, 1.5))),

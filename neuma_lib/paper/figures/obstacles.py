@@ -40,7 +40,9 @@ def data(inputs, params, log) -> ImageGrid:
         arrays, attributes = read_arrays(file, required=("x", "tracers", "frames"))
         picked = rendering.evenly(params.shown, len(arrays["frames"]))
         seconds = arrays["frames"][picked] * attributes["dt"]
-        mesh = place(scene["shape"], scene["size"], scene["height"], scene["center"])
+        mesh = place(
+            scene["shape"], scene["size"], scene["height"], scene["center"], rotation=scene["rotation"]
+        )
         look = AppearanceConfig(**scene["appearance"])
         body = make_body(mesh, look, arrays["x"][picked], arrays["tracers"][picked])
         model = simulator(parse_json(attributes["simulation"], file))

@@ -25,10 +25,9 @@ def data(inputs, params, log) -> dict:
 @style.styled
 def draw(data: Mapping) -> Figure:
     """A square panel for each quantity, with the diagonal."""
-    columns = min(2, len(data))
-    rows = -(-len(data) // columns)
-    figure = style.new_figure(columns * 0.5 * style.PAGE, rows * 0.5 * style.PAGE + 0.3)
-    panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+    rows = -(-len(data) // 2)
+    figure = style.new_figure(style.PAGE, rows * 0.5 * style.PAGE + 0.3)
+    panels = figure.subplots(rows, 2, squeeze=False, sharex=True, sharey=True)
     for axes in panels.flat[len(data) :]:
         axes.set_axis_off()
     for axes, (quantity, methods) in zip(panels.flat, data.items(), strict=False):
@@ -43,9 +42,11 @@ def draw(data: Mapping) -> Figure:
             axes.plot(levels, middle, color=color, label=method)
         axes.set(xlim=(0, 100), ylim=(0, 100), aspect="equal", title=quantity.replace("_", " "))
         axes.grid()
-    for axes in panels[-1]:
+    used = panels.flat[: len(data)]
+    for axes in used[-2:]:
         axes.set_xlabel("level [%]")
-    for axes in panels[:, 0]:
+        axes.tick_params(labelbottom=True)
+    for axes in used[::2]:
         axes.set_ylabel("truths inside [%]")
     style.legend_above(figure, panels.flat[0], 3)
     return figure
