@@ -13,6 +13,8 @@ rule specimen:
         figure=f"{RESULTS}/specimens/{{specimen}}/fit.png",
     wildcard_constraints:
         specimen="|".join(SETTINGS.specimens) or "none",
+    resources:
+        runtime=240,
     params:
         specimen=lambda wildcards: SETTINGS.specimens[wildcards.specimen].plain(),
     script:
