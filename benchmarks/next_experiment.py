@@ -1,11 +1,11 @@
 """Chosen second launches against random ones: standard deviations and errors of the constants after a joint fit.
 
-    python -m benchmarks.next_experiment --seeds 1 2 --count 6 --random 2 --out chosen.json
+    python -m benchmarks.next_experiment --seeds 1 --count 4 --random 2 --candidates 16 --out chosen.json
 
 Materials, shapes and first launches are the random scenes of development seeds. Videos are renders of the true body,
 filled with particles that have one Gaussian each. The reconstruction has other and fewer particles and Gaussians, so
 that residuals are correlated errors of a reconstruction. There is no Blender and no fit of Gaussians, hence a material
-takes about two minutes on a core. Only the true family is fitted. The choice does not read the truth. Results are
+takes about a core minute. Only the true family is fitted. The choice does not read the truth. Results are
 written after each material, and materials in the file are skipped.
 """
 

@@ -47,6 +47,7 @@ MADE_BY = {
     "views": "results/views.csv",
     "outside": "results/outside.csv",
     "identified": "results/identified.csv",
+    "calibration": "calibration",
     "table1_systems": "results/table1_systems.csv",
     "table2_systems": "results/table2_systems.csv",
 }

@@ -22,7 +22,10 @@ BELOW_FLOOR, ABOVE_FLOOR = 0.1, 0.15
 VOLUME_RATIO = (0.6, 1.25)
 """Range of the volume of the surface relative to the visual hull on the floor."""
 _QUANTILE = 0.01  # of the heights, to which single stray Gaussians do not matter
-_OWN_MASKS = "put masks of the object alone into the folder masks/photographs, white where the object is"
+_OWN_MASKS = (
+    "select the object with a box (`object` in capture.yaml), or put masks of the object alone into the folder"
+    " masks/photographs, white where the object is"
+)
 
 
 def check_masks(ious: Sequence[float], where: str) -> None:

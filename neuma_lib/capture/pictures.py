@@ -26,6 +26,8 @@ from neuma_lib.project.capture_folder import HEIF
 
 ORIENTATION = 0x0112
 """EXIF tag of the orientation."""
+QUARTER_TURNS = {1: 0, 6: 1, 3: 2, 8: 3}
+"""Clockwise quarter turns after which a stored picture is upright, by EXIF orientation."""
 _STORED_UPRIGHT = 6  # orientation of a picture that was stored upright and turned back by `read_picture`
 SHEET_WIDTH = 1600
 """Width of a contact sheet [px]."""
@@ -97,6 +99,17 @@ def orientation_of(file: Path, size: tuple[int, int]) -> int | None:
     with _opened(file) as image, reading(file, "an image"):
         stated = image.getexif().get(ORIENTATION)
         return _STORED_UPRIGHT if image.size != tuple(size) and stated in (None, 1) else stated
+
+
+def sensor_pixels(places: np.ndarray, orientation: int | None, size: tuple[int, int]) -> np.ndarray:
+    """Places (P, 2) [px] in the sensor's width and height from those in an upright, displayed picture.
+
+    ``orientation`` is that of `orientation_of`. Mirrored orientations do not occur in photographs.
+    """
+    x, y = np.asarray(places, float).T
+    width, height = size
+    turned = [(x, y), (y, height - x), (width - x, height - y), (width - y, x)]
+    return np.stack(turned[QUARTER_TURNS.get(orientation or 1, 0)], axis=-1)
 
 
 @contextmanager

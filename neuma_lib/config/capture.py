@@ -25,20 +25,29 @@ def _inside(name: str) -> str:
 
 Inside = Annotated[str, AfterValidator(_inside)]
 Pixel = tuple[float, float]
+Rectangle = tuple[float, float, float, float]
 
 
 class LengthConfig(Section):
-    """A known length between two points that are marked in photographs. It replaces the board."""
+    """A known length between two marked points, or between the cameras of two photographs. It replaces the board."""
 
-    metres: float = Field(gt=0, description="distance between the points [m]")
+    metres: float = Field(gt=0, description="the length [m]")
+    deviation: float = Field(0.0, ge=0, description="its standard deviation [m], for the report")
+    cameras: tuple[str, str] | None = Field(
+        None,
+        description="two photographs; the length is that between their cameras, as the free flight measures it by "
+        "gravity",
+    )
     ends: dict[str, tuple[Pixel, Pixel]] = Field(
-        description="photograph -> (x, y) of both points [px], from the upper left corner; in at least two photographs"
+        {},
+        description="photograph -> (x, y) of both points [px], from the upper left corner of the displayed picture; in "
+        "two photographs or more, or in one if both points are on the floor",
     )
 
     @model_validator(mode="after")
-    def _seen_twice(self) -> LengthConfig:
-        if len(self.ends) < 2:
-            raise ValueError("ends: mark the two points in at least two photographs")
+    def _between_two_objects(self) -> LengthConfig:
+        if bool(self.ends) == (self.cameras is not None):
+            raise ValueError("ends: mark the two points in photographs, or name two photographs as `cameras`")
         return self
 
 
@@ -75,7 +84,9 @@ class CaptureConfig(Section):
         None, description="the printed board; it defines scale, floor and the vertical"
     )
     length: LengthConfig | None = Field(
-        None, description="a known length, which defines the scale without a board; the floor is fitted"
+        None,
+        description="a known length, which defines the scale without a board; the floor is fitted; without both, "
+        "the free flight states the length to enter",
     )
     photographs: Inside = Field("photos", description="folder of the photographs, all of one camera and zoom")
     stills: Inside = Field(
@@ -99,6 +110,11 @@ class CaptureConfig(Section):
     masks: Inside = Field(
         "masks",
         description="folder of own masks, `photographs/<photograph>.png` and `<take>/<camera>/<frame>.png`; optional",
+    )
+    object: dict[str, Rectangle] = Field(
+        {},
+        description="photograph -> (x0, y0, x1, y1) of a tight box around the whole object [px], from the upper left "
+        "corner of the displayed picture; needed if other objects are around; one is enough",
     )
     center: Pixel | None = Field(
         None,
@@ -129,15 +145,16 @@ class CaptureConfig(Section):
     frames: int = internal(60, "maximum number of training frames of a camera, evenly spaced", ge=8)
     width: int = internal(160, "longer side of the training images [px]", ge=32, le=2048)
 
+    @property
+    def metric(self) -> bool:
+        """Whether the settings define the scale. Otherwise gravity in a video measures it."""
+        return self.poses != "photographs" or self.board is not None or self.length is not None
+
     @model_validator(mode="after")
     def _metres_from_somewhere(self) -> CaptureConfig:
         if self.board is None and self.poses == "board":
             raise ValueError(
                 "poses: board needs `board: {square: ...}` with the measured side of a square [m]"
-            )
-        if self.board is None and self.length is None and self.poses == "photographs":
-            raise ValueError(
-                "the scale is unknown: give `board: {square: ...}` with the measured side of a square [m], or `length`"
             )
         if self.board is not None and self.length is not None:
             raise ValueError("length: the board already defines the scale; give one of the two")
@@ -145,6 +162,11 @@ class CaptureConfig(Section):
             raise ValueError(
                 "center: it is a point in the frame of the board, which is not used here; leave it out"
             )
+        for name, (x0, y0, x1, y1) in self.object.items():
+            if x1 - x0 < 8 or y1 - y0 < 8:
+                raise ValueError(
+                    f"object.{name}: expected [left, upper, right, lower] in pixels, 8 apart or more"
+                )
         if self.poses == "board" and self.lens is None:
             raise ValueError("poses: board needs `lens`, a file with the intrinsics of the cameras")
         return self

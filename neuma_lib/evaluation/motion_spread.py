@@ -160,7 +160,9 @@ def predict_with_spread(
         InputError: the body touches nothing before the last frame.
         NonFiniteError: the simulation with the identified constants is unstable.
     """
-    friction = recorded_friction(identified)
+    fit = identified[of]
+    of_friction = fit["quantities"].get(FRICTION, {})
+    friction = of_friction.get("value", recorded_friction(identified))
     coarse, fine = (
         each if friction is None else replace(each, model=each.model.with_friction(friction))
         for each in resolutions
@@ -169,7 +171,7 @@ def predict_with_spread(
     state = launch.state(fine.particles, seed).to(device)
     own = torch.from_numpy(np.sort(generator.choice(len(state.x), min(points, len(state.x)), replace=False)))
     steps, coarse_steps = (steps_at(each.model, times) for each in (fine, coarse))
-    fit, stable_in = identified[of], (fine.model, launch.density)
+    stable_in = (fine.model, launch.density)
     centre = fine.path(launch, stable_law(fit, *stable_in), steps, state.x, seed)
     first = first_contact(fine.model, centre, state.vol0, steps)
     if first == len(steps):
@@ -197,7 +199,6 @@ def predict_with_spread(
         return (high - low) / 2, len(laws) + 1 - len(sampled)
 
     drawn = {"dt": fine.model.dt, "count": DRAWS, "of": of, "stable_in": stable_in}
-    of_friction = fit["quantities"].get(FRICTION, {})
     laws = constants_draws(identified, model_std, seed=seed, **drawn)
     spread, failed = half_width(laws, of_friction.get("log_std", 0.0))
     laws = constants_draws({**identified, "ties": []}, 0.0, seed=seed + 1, covariance="laplace", **drawn)

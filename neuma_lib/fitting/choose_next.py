@@ -41,6 +41,7 @@ from neuma_lib.splatting.viewpoints import video_views
 
 MIN_GAIN = 0.05
 """Relative decrease of what is ranked below which an experiment is useless."""
+_LENGTHS = ("height", "center", "velocity")  # settings with lengths [m] or [m/s]
 _IDENTIFY = "Run `snakemake --cores 2 results/<scene>/identified.json` first"
 
 
@@ -98,25 +99,30 @@ class Selection:
         """Whether the best option gains at least `MIN_GAIN`."""
         return self.gain(self.options[0]) >= MIN_GAIN
 
-    def as_dict(self) -> dict[str, Any]:
-        """Plain numbers for JSON."""
+    def as_dict(self, scale: float = 1.0) -> dict[str, Any]:
+        """Plain numbers for JSON, with lengths in metres of a room of which one has ``scale`` metres of the box."""
+        ranked = scale if self.goal == "prediction" else 1.0
         return {
             "family": self.known.family.name,
             "goal": self.goal,
-            "before": self.before,
+            "before": self.before / ranked,
             "useful": self.useful,
             "known": stds(self.known, self.settings),
-            **({"prediction_std": self.prediction} if self.prediction is not None else {}),
+            **({"prediction_std": self.prediction / scale} if self.prediction is not None else {}),
             "failed": self.failed,
-            "candidates": [self._option(option) for option in self.options],
+            "candidates": [self._option(option, scale) for option in self.options],
         }
 
-    def _option(self, option: Option) -> dict[str, Any]:
+    def _option(self, option: Option, scale: float) -> dict[str, Any]:
         fit, settings = option.forecast.fit, self.settings
+        own = {
+            key: (np.array(value) / scale).tolist() if key in _LENGTHS and scale != 1.0 else value
+            for key, value in option.settings.items()
+        }
         return {
             "kind": option.kind,
-            "settings": option.settings,
-            "after": option.after,
+            "settings": own,
+            "after": option.after / (scale if self.goal == "prediction" else 1.0),
             "expected": stds(fit, settings),
             "becomes_determined": {
                 name: {"before": before, "after": after}
@@ -126,7 +132,7 @@ class Selection:
                 name: value if math.isfinite(value) else None
                 for name, value in option.forecast.evidence.items()
             },
-            **({"prediction_std": option.prediction} if option.prediction is not None else {}),
+            **({"prediction_std": option.prediction / scale} if option.prediction is not None else {}),
             "covariance": fit.covariance.tolist(),
         }
 

@@ -186,8 +186,13 @@ class FamilyRun:
         for v, video in enumerate(self.videos):
             video.differentiate(self._candidate(self._u, v))
 
-    def linearise_at(self, values: Values) -> Linearisation:
+    def linearise_at(self, values: Values, covariance: np.ndarray | None = None) -> Linearisation:
         """The problem at the last level, linearised at constants and the estimated motions without a fit.
+
+        Args:
+            covariance: that of the unbounded constants, shape (k, k). Differences then have the width of a standard
+                deviation along its principal axes, on the side where the images change less, since a derivative hides
+                plateaus of the images (see `covariance_of_plateaus`). None: derivatives.
 
         Raises:
             NonFiniteError: the rollout diverges.
@@ -197,7 +202,40 @@ class FamilyRun:
             raise NonFiniteError(self.family.name, "the simulation with the identified constants diverges")
         if any(video.by_deviation is None for video in self.videos):
             self.differentiate()
+        if covariance is not None:
+            self._columns = {self._u.tobytes(): self._wide_columns(covariance)}
+            self._exact = True
         return self.linearise(self._u, self._free)
+
+    def _wide_columns(self, covariance: np.ndarray) -> list[list[Tensor]]:
+        """Columns of the constants from differences of a standard deviation along principal axes (`linearise_at`)."""
+        base, k = self._residual(self._u), self._constants
+        variances, axes = np.linalg.eigh(covariance)
+        widths = np.clip(np.sqrt(variances), self.settings.difference, self.settings.longest_step)
+        columns = [[torch.zeros_like(r) for r in base] for _ in range(k)]
+        for width, axis in zip(widths, axes.T, strict=True):
+            step = np.append(width * axis, np.zeros(len(self._u) - k))
+            points = [point for point in (self._u + step, self._u - step) if self._reaches(point)]
+            changes = [
+                [(t - r) * (sign / width) for t, r in zip(other, base, strict=True)]
+                for other, sign in zip(
+                    self._simulate(points),
+                    (float(np.sign((p - self._u) @ step)) for p in points),
+                    strict=True,
+                )
+                if other is not None
+            ]
+            if changes:
+                change = min(changes, key=lambda each: _squares(self._at_level(each)))
+                for column, part in zip(columns, axis, strict=True):
+                    for own, each in zip(column, change, strict=True):
+                        own += part * each
+        return columns
+
+    def _reaches(self, unknowns: np.ndarray) -> bool:
+        """Whether the stiffness limit of dt admits the constants of unknowns."""
+        reached = self.family.unbounded(self._values(unknowns)) - self._origin
+        return bool(np.allclose(reached, unknowns[: self._constants], atol=1e-6))
 
     def imitate(self, values: Values, noise: float) -> None:
         """Fit at the last level from constants, with a known variance of the residuals per unit of curvature.

@@ -14,6 +14,10 @@ A rival family is first fitted to images of the identified law in the existing v
 as it can. In a new experiment it may still change within what these videos admit. Half its remaining squared residual
 over s^2 is the expected logarithm of the Bayes factor, without the Occam factors of the constants.
 
+Derivatives are differences as wide as the standard deviations of the constants, on the side where the images change
+less. A constant on a plateau of the images, such as a yield stress that is hardly reached, has no information then,
+although it has a derivative.
+
 All of this is to first order about the identified constants, and assumes that an experiment is modelled as well as the
 existing ones.
 """
@@ -141,7 +145,7 @@ class Knowledge:
         videos = [each.residuals(settings) for each in filmed]
         for video in videos:
             video.weight = (videos[0].fitted_pixels / video.fitted_pixels) ** 0.5
-        curvature = _linearised(fit.family, fit.values, videos, settings).curvature
+        curvature = _linearised(fit, videos, settings).curvature
         noise = matched_noise(curvature, fit.covariance, settings.spread)
         own = cls(fit, settings, noise)
         for family, values in rivals:
@@ -177,7 +181,7 @@ class Knowledge:
         return Forecast(replace(self.fit, covariance=covariance), gained, evidence)
 
     def _linearised(self, video: VideoResiduals) -> Linearisation:
-        return _linearised(self.fit.family, self.fit.values, [video], self.settings)
+        return _linearised(self.fit, [video], self.settings)
 
     def _evidence(self, rival: _Rival, video: VideoResiduals) -> float:
         """Expected logarithm of the Bayes factor in a video of the identified family against a rival.
@@ -197,16 +201,14 @@ class Knowledge:
         return 0.5 * max(fit.cost / self.noise - g @ np.linalg.solve(H, g), 0.0)
 
 
-def _linearised(
-    family: Family, values: Values, videos: Sequence[VideoResiduals], settings: IdentifyConfig
-) -> Linearisation:
-    """Replace videos by the images of a family, and linearise them there, with residuals of 0."""
-    at = Candidate(family.law_spec(values), np.zeros(NUISANCES))
+def _linearised(fit: FamilyFit, videos: Sequence[VideoResiduals], settings: IdentifyConfig) -> Linearisation:
+    """Replace videos by the images of a fit, and linearise them there, with residuals of 0."""
+    at = Candidate(fit.family.law_spec(fit.values), np.zeros(NUISANCES))
     for video in videos:
         if not video.observe(at):
-            raise NonFiniteError(family.name, "the simulation with the identified constants diverges")
-    run = FamilyRun(family, videos, [len(video.frames) for video in videos], settings)
-    return run.linearise_at(values)
+            raise NonFiniteError(fit.family.name, "the simulation with the identified constants diverges")
+    run = FamilyRun(fit.family, videos, [len(video.frames) for video in videos], settings)
+    return run.linearise_at(fit.values, fit.covariance)
 
 
 def information(curvature: np.ndarray, noise: float, constants: int) -> np.ndarray:

@@ -149,11 +149,16 @@ def read_capture(folder: str | Path) -> Capture:
             )
     if PHOTOGRAPHS in cameras:
         raise InputError(folder, f"a video camera cannot be named '{PHOTOGRAPHS}'", "Rename its files")
-    if settings.length:
-        names = [file.name for file in photographs]
-        for name in settings.length.ends:
-            if name not in names:
-                raise InputError(f"{source}: length.ends.{name}", f"no such photograph{hint(name, names)}")
+    names = [file.name for file in photographs]
+    length = settings.length
+    marked = {
+        "length.ends": length.ends if length else (),
+        "length.cameras": length.cameras or () if length else (),
+        "object": settings.object,
+    }
+    for key, name in ((key, name) for key, files in marked.items() for name in files):
+        if name not in names:
+            raise InputError(f"{source}: {key}.{name}", f"no such photograph{hint(name, names)}")
     return Capture(folder, settings, photographs, stills, takes)
 
 

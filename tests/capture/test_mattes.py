@@ -1,5 +1,7 @@
 """Mattes on disk and back, cameras in metres again, own masks, and the flight's checks."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -121,3 +123,6 @@ def test_a_camera_that_saw_no_flight_is_named():
     )
     with refused("mug, first, left"):
         flight.find_flight([seen], "mug, first")
+    wide = disc(30).any(axis=0).sum() / WIDTH, disc(30).any(axis=1).sum() / HEIGHT
+    assert seen.row_delay == pytest.approx(max(wide) / 60)  # a frame takes at most 1/60 s
+    assert replace(seen, row_time=1e-5).row_delay == 0

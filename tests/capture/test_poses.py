@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from PIL import Image
 
 from neuma_lib.capture import pictures as pics
@@ -13,6 +14,7 @@ from neuma_lib.capture.calibration import drawing, placement, poses
 from neuma_lib.capture.calibration import room as rooms
 from neuma_lib.capture.calibration.lens import Lens, read_lens
 from neuma_lib.capture.masks.regions import read_mask
+from neuma_lib.capture.motion.gravity import Gravity
 from neuma_lib.config.capture import CaptureConfig
 from neuma_lib.errors import InputError
 from neuma_lib.io.images import OPENGL_TO_OPENCV, read_transforms
@@ -431,3 +433,60 @@ def test_the_same_seed_finds_the_same_places(drawn, tmp_path):
     np.testing.assert_array_equal(first.lenses[-1].K, ROOM_LENSES["fixed"].K)
     np.testing.assert_array_equal(first.viewmats, second.viewmats)
     np.testing.assert_array_equal(first.points, second.points)
+
+
+def on_a_floor(rng, true, world):
+    """Poses of a drawn reconstruction whose points lie on a floor."""
+    floor = np.concatenate([rng.uniform(-0.3, 0.4, (400, 2)), np.zeros((400, 1))], axis=1)
+    base = reconstruction(world.move_cameras(true))
+    return poses.replace(base, points=world.apply(floor), colours=np.zeros((400, 3), np.uint8))
+
+
+def test_two_points_on_the_floor_in_one_photograph_are_a_length():
+    true, world = around(8), placement.Similarity(3.0, random_similarity(np.random.default_rng(7)).rotation)
+    base = on_a_floor(np.random.default_rng(6), true, world)
+    ends = np.array([[0.02, 0.1, 0.0], [0.20, 0.1, 0.0]])
+    marks = LENS.project(ends @ true[2][:3, :3].T + true[2][:3, 3]).tolist()
+    room = rooms.room_of(base, {}, CaptureConfig(length={"metres": 0.18, "ends": {"2.png": marks}}))
+    assert room.room_from_world.scale * 3 == pytest.approx(1, rel=1e-6)
+    assert room.scale.source == "a length on the floor" and 1e-4 < room.scale.deviation < 0.05
+
+
+def test_the_length_that_gravity_gives_makes_a_room_metric():
+    """Without board and length, the room has an arbitrary unit. Gravity in it states the length to enter."""
+    true, world = around(8), placement.Similarity(3.0, random_similarity(np.random.default_rng(7)).rotation)
+    base = on_a_floor(np.random.default_rng(6), true, world)
+    room = rooms.room_of(base, {}, CaptureConfig())
+    assert room.scale is None
+    unit = room.room_from_world.scale * 3  # of a metre
+    gravity = Gravity(np.array([0, -9.81 * unit, 0]), (0.05 * unit) ** 2 * np.eye(3), "triangulated")
+    centres = placement.camera_centres(room.poses.viewmats)
+    places = {name.split("/")[1]: c.tolist() for name, c in zip(base.names, centres)}
+    stated = yaml.safe_load(gravity.known_length(places, "first").remedy.split("capture.yaml: ")[1])
+    metric = rooms.room_of(base, {}, CaptureConfig(**stated))
+    assert metric.room_from_world.scale * 3 == pytest.approx(1, rel=1e-3)
+    assert metric.scale.source == "gravity in the video"
+    assert metric.scale.deviation == pytest.approx(0.05 / 9.81, rel=0.05)
+    one = Gravity(gravity.a, gravity.covariance, "one view in a plane", several=False)
+    assert "second camera" in one.known_length(places, "first").remedy
+
+
+def test_the_floor_is_that_under_the_selected_object():
+    """A table with fewer points than the floor of the room."""
+    rng = np.random.default_rng(8)
+    true = around(8)
+    base = on_a_floor(rng, true, placement.Similarity())
+    table = np.concatenate([rng.uniform(0.0, 0.2, (120, 2)), np.full((120, 1), 0.0)], axis=1)
+    lower = np.concatenate([rng.uniform(-1.5, 1.5, (600, 2)), np.full((600, 1), -0.6)], axis=1)
+    body = rng.uniform([0.08, 0.08, 0.0], [0.12, 0.12, 0.05], (60, 3))
+    points = np.concatenate([table, lower, body])
+    numbers = np.arange(len(points))
+    base = poses.replace(base, points=points, sightings=(numbers,) * len(base.names))
+    corners = np.array(list(np.ndindex(2, 2, 2))) * [0.04, 0.04, 0.05] + [0.08, 0.08, 0.0]
+    seen = LENS.project(corners @ true[0][:3, :3].T + true[0][:3, 3])
+    box = [*seen.min(axis=0).tolist(), *seen.max(axis=0).tolist()]
+    heights = []
+    for settings in (CaptureConfig(), CaptureConfig(object={"0.png": box})):
+        room = rooms.room_of(base, {}, settings)
+        heights.append(room.poses.points[:120, 1].mean())
+    assert heights[0] > 0.1 and abs(heights[1]) < 1e-3

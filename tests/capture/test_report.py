@@ -230,6 +230,10 @@ def test_a_capture_without_faults_has_no_warnings():
         ({"flight": {"spin_rad_s": None}}, "no spin was measured"),
         ({"cameras": {"left": 1e-3, "right": 0.0}}, "no exposure is set for right.*2.0 mm"),
         (
+            {"flight": {**GOOD_FLIGHT, "row_delay_s": {"left": 2e-3, "right": 1e-4}}},
+            "no row_time.*at most 4.0 mm for left at",
+        ),
+        (
             {"prediction": {**GOOD_MOTION, "frames_after_contact": {"left": 3}}},
             "one, left: only 3 frames",
         ),

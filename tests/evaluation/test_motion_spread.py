@@ -98,16 +98,19 @@ def test_other_motions_start_inside_and_touch_the_floor():
 def test_fitted_friction_is_used_and_sampled(launch):
     """A launch along the floor is slower with friction, and less sure where the coefficient is."""
     sliding = Launch(launch.mesh, (2.0, -1.5, 0.0))
-    record = {"value": 0.3, "log_std": 0.3}
+    record = {"value": 5.0, "log_std": 0.3}  # of another grid
 
     def content(log_std):
         known = identified(**{FRICTION: record})
-        known["best"]["quantities"] = {FRICTION: {"log_std": log_std, "laplace_log_std": 0.0}}
+        quantity = {"value": 0.3, "log_std": log_std, "laplace_log_std": 0.0}
+        known["best"]["quantities"] = {FRICTION: quantity}
         return known
 
     free = predicted(sliding, identified(), (FINE, Resolution(MODEL.with_friction(0.0), 260)))
     rough, unsure = predicted(sliding, content(0.0)), predicted(sliding, content(0.5))
     assert rough.value[-1, :, 0].mean() < free.value[-1, :, 0].mean() - 1e-3
+    known = predicted(sliding, identified(), (FINE, Resolution(MODEL.with_friction(0.3), 260)))
+    np.testing.assert_allclose(rough.value, known.value, atol=1e-6)
     assert unsure.std[-1, :, 0].mean() > rough.std[-1, :, 0].mean() + 1e-3
     assert unsure.laplace_std.abs().max() < 1e-5
     sticks = predicted(sliding, identified(**{FRICTION: {"at_least": 1.0}}))

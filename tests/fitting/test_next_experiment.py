@@ -312,6 +312,11 @@ def test_candidates_are_ranked_and_written(alone):
     assert after == sorted(after) and after[0] < choice.before and choice.useful
     written = choice.as_dict()
     assert written["candidates"][0]["expected"] == stds(choice.options[0].forecast.fit, chosen)
+    for box, room in zip(written["candidates"], choice.as_dict(scale=2.0)["candidates"], strict=True):
+        if box["kind"] == "launch":
+            assert box["settings"]["velocity"] == [2 * v for v in room["settings"]["velocity"]]
+            assert box["settings"]["height"] == 2 * room["settings"]["height"]
+            assert box["settings"]["spin"] == room["settings"]["spin"]
 
 
 def test_a_record_is_read_and_a_missing_family_refused(alone):
@@ -321,3 +326,27 @@ def test_a_record_is_read_and_a_missing_family_refused(alone):
     with refused("identified.json"):
         read_fit(record, settings(other=law("neo_hookean")))
     assert read_rivals(record, settings(), fit, 2) == []
+
+
+def linearised(values, covariance=None, spec=HENCKY):
+    family = Family("tested", spec)
+    each = experiment(std=(0.0,) * 6).residuals(settings())
+    assert each.observe(Candidate(family.law_spec(values), np.zeros(NUISANCES)))
+    return FamilyRun(family, [each], [len(FRAMES)], settings()).linearise_at(values, covariance).curvature
+
+
+def test_narrow_differences_are_derivatives():
+    """With a tiny covariance along the constants, differences have the width of derivatives, 4 %, on the side with the
+    smaller change. For E, whose images change smoothly, the sides differ by less than a third."""
+    values = {"E": 3e4, "nu": 0.3}
+    derivatives, narrow = (np.diag(linearised(values, each)) for each in (None, np.diag([1e-8, 2e-8])))
+    assert (narrow <= derivatives * (1 + 1e-9)).all() and narrow[0] > derivatives[0] * 2 / 3
+
+
+def test_a_plateau_has_less_information_than_its_edge():
+    """A yield stress just below the largest stress of the launch: lower ones change the images, higher ones do not."""
+    plastic = law("hencky", "von_mises", yield_stress=12e3)
+    values = {"E": 3e4, "nu": 0.3, "yield_stress": 12e3}
+    edge = linearised(values, spec=plastic)[2, 2]
+    wide = linearised(values, np.diag([1e-8, 1e-8, 1.0]), plastic)[2, 2]
+    assert wide < 0.1 * edge

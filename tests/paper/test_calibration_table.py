@@ -8,10 +8,11 @@ import io
 import numpy as np
 import pytest
 
-from benchmarks.calibration import calibrated, cross_validated, errors_by_quantity, report
+from benchmarks.calibration import calibrated, cross_validated, errors_by_quantity, main, report
 from neuma_lib.evaluation import calibration
 from neuma_lib.evaluation.calibration import GRID, LEVELS, MATERIAL, MOTION, measured_quantiles
 from neuma_lib.fitting.families import FRICTION
+from neuma_lib.io.files import write_json
 from neuma_lib.paper.calibration_record import constants_with_truths, families_with_truth
 from neuma_lib.paper.calibration_table import (
     CALIBRATED,
@@ -153,6 +154,33 @@ def test_the_calibration_is_what_was_measured():
     assert 0.15 < content["temperature"] < 0.6
     text = report(scenes, content)
     assert "180 values of 60 scenes" in text and "Brier score" in text
+
+
+def test_the_command_stores_what_all_intervals_use(tmp_path, monkeypatch, capsys):
+    """Only with --write, and only from scenes of development seeds."""
+    scenes, stored = synthetic(12, 0), tmp_path / "stored.json"
+    for scene in scenes:
+        write_json(tmp_path / f"{scene['name']}.json", scene)
+    files = sorted(map(str, tmp_path.glob("random2_*.json")))
+    for module in ("benchmarks.calibration", "neuma_lib.evaluation.calibration"):
+        monkeypatch.setattr(f"{module}.FILE", stored)
+
+    def run(*arguments):
+        monkeypatch.setattr("sys.argv", ["calibration", *arguments])
+        main()
+        return capsys.readouterr().out
+
+    assert "of 12 scenes" in run(*files) and not stored.exists()
+    assert str(stored) in run(*files, "--write")
+    content = calibration.stored.__wrapped__()
+    expected = calibrated(scenes, {})
+    assert content["quantiles"] == expected["quantiles"] and content["temperature"] == expected["temperature"]
+    assert content["source"]["seeds"] == [2] and len(content["source"]["scenes"]) == 12
+    write_json(files[0], scenes[0] | {"development": False})
+    stored.unlink()
+    with pytest.raises(SystemExit):
+        run(*files, "--write")
+    assert not stored.exists()
 
 
 def test_cross_validation_uses_other_scenes():

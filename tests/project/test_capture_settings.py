@@ -79,13 +79,15 @@ def test_links_stay_in_the_folder(mug, tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", ["square"]),
+        ("object: {a.JPG: [10, 10, 12, 90]}\n", ["object.a.JPG"]),
+        ("object: {c.jpg: [10, 10, 90, 90]}\n", ["object.c.jpg"]),
         ("board: {}\n", ["board.square"]),
         ("board: {square: 30}\n", ["board.square"]),
         ("board: {square: 0.03, sqares: [6, 8]}\n", ["board.sqares", "squares"]),
         ("board: {square: 0.03, squares: [2, 8]}\n", ["board", "3"]),
         ("board: {square: 0.03}\nposes: board\n", ["lens"]),
-        ("length: {metres: 1, ends: {a.JPG: [[0, 0], [1, 1]]}}\n", ["length"]),
+        ("length: {metres: 1}\n", ["length", "ends"]),
+        ("length: {metres: 1, cameras: [a.JPG, c.jpg]}\n", ["length.cameras.c.jpg"]),
         (
             "length: {metres: 1, ends: {a.JPG: [[0, 0], [1, 1]], c.jpg: [[0, 0], [1, 1]]}}\n",
             ["length.ends.c.jpg"],

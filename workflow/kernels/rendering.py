@@ -1,4 +1,4 @@
-"""Kernels from particles to the image loss, and of the binding of Gaussians to particles."""
+"""Kernels from particles to the image loss."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import torch
 
 from neuma_lib.coupling.binding import Binding
 from neuma_lib.coupling.deformation import deform
-from neuma_lib.coupling.particle_binding import bind
 from neuma_lib.splatting.image_loss import mean_squared_error
 from neuma_lib.splatting.rasterizer import rasterize, rasterized_error
 
@@ -15,7 +14,7 @@ INTRINSICS = [[16.0, 0.0, 8.0], [0.0, 16.0, 8.0], [0.0, 0.0, 1.0]]
 
 
 def compile_kernels(device: torch.device) -> None:
-    """The loss of one small image of four Gaussians, forward and backward, and a binding on the CPU."""
+    """The loss of one small image of four Gaussians, forward and backward."""
     x0 = torch.tensor([[0.1, 0, 2], [0, 0.1, 2], [-0.1, 0, 2], [0, -0.1, 2]], device=device)
     eye = torch.eye(3, device=device).expand(4, 3, 3)
     x, F = x0[None].clone().requires_grad_(), eye[None].clone().requires_grad_()
@@ -29,4 +28,3 @@ def compile_kernels(device: torch.device) -> None:
     observed = torch.zeros(1, 1, SIZE, SIZE, 4, dtype=torch.uint8, device=device)
     compared = mean_squared_error(rasterize(*scene)[0], observed)
     (compared + rasterized_error(*scene, observed)).sum().backward()
-    bind(torch.zeros(1, 3), torch.eye(3)[None], torch.zeros(1, 3))

@@ -12,7 +12,10 @@ rule capture_photograph_masks:
     input:
         room=f"{DATA}/{{capture}}/room/transforms.json",
         report=f"{RESULTS}/{{capture}}/room.json",
+        poses=f"{RESULTS}/{{capture}}/poses.json",
+        points=f"{RESULTS}/{{capture}}/points.ply",
         network=of_capture(saliency_network),
+        marked=of_capture(marked_photographs),
         own=of_capture(lambda capture: list(map(str, capture.own_masks("photographs").values()))),
     output:
         transforms=f"{DATA}/{{capture}}/static/transforms.json",
@@ -26,6 +29,7 @@ rule capture_photograph_masks:
         longest=capture_setting("longest"),
         board=of_capture(lambda capture: capture.settings.board and capture.settings.board.plain()),
         center=capture_setting("center"),
+        object=capture_setting("object"),
         name="{capture}",
     script:
         "../scripts/capture_photograph_masks.py"
@@ -76,7 +80,7 @@ rule capture_flight:
     params:
         cameras=TAKE_CAMERAS,
         timing=camera_timing,
-        metric=True,
+        metric=of_capture(lambda capture: capture.settings.metric),
         name="{capture}, {take}",
     script:
         "../scripts/capture_flight.py"

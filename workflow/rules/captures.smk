@@ -140,9 +140,15 @@ def saliency_network(capture):
     return [] if all(p.stem in own for p in capture.photographs) else [f"{DATA}/weights/u2netp.onnx"]
 
 
+def marked_photographs(capture):
+    """Photographs in which the object is selected, whose EXIF orientation matters."""
+    return [str(file) for file in capture.photographs if file.name in capture.settings.object]
+
+
 def room_settings(capture):
-    """Settings that the room depends on."""
-    return capture.settings.model_dump(mode="json", exclude={*OF_VIDEOS, "photographs", "masks"})
+    """Settings that the room depends on. A fitted floor is that of the selected object."""
+    unused = {*OF_VIDEOS, "photographs", "masks"} | ({"object"} if capture.settings.board else set())
+    return capture.settings.model_dump(mode="json", exclude=unused)
 
 
 def camera_timing(wildcards):

@@ -30,7 +30,7 @@ def of_predicted(function):
 rule next:
     input:
         **{name: of_each_video(of_replicate(file)) for name, file in BODY.items()},
-        kernels=kernels("binding", "geometry", "laws", "rendering"),
+        kernels=kernels("geometry", "laws", "rendering"),
         transforms=of_each_video(of_data("dynamic/transforms.json")),
         velocity=of_each_video(of_replicate("velocity.json")),
         identified=of_replicate("identified.json"),
@@ -58,6 +58,7 @@ rule next:
             }
         ),
         rendered=of_section(lambda scene: scene.has_truth and scene.images.dynamic is None),
+        scale=of_section(lambda scene: scene.captured.scale if scene.captured else 1.0),
         seed=SETTINGS.seed,
         exposure=exposure,
         device=SETTINGS.device,

@@ -9,9 +9,10 @@ from neuma_lib.capture.masks.agreement import check_one_object
 from neuma_lib.capture.masks.mattes import Mattes, metric_camera
 from neuma_lib.capture.motion.flight import Filmed, draw_flight, draw_tracks, find_flight, report
 from neuma_lib.capture.motion.timing import read_sound
-from neuma_lib.capture.pictures import evidence
+from neuma_lib.capture.pictures import evidence, group_of
 from neuma_lib.io.files import listed, read_json, write_json
 from neuma_lib.io.images import read_transforms
+from neuma_lib.project.capture_folder import PHOTOGRAPHS
 from workflow.stage import run_script
 
 
@@ -32,8 +33,12 @@ def main(inputs, output, params, run) -> None:
     with evidence(output.picture, lambda path: draw_tracks(path, views, params.name)):
         cues = read_cues(read_json(room)["up"]) if room else ()
         flight = find_flight(views, params.name, params.metric, cues)
-        if params.metric and flight.agreement is not None:
+        if room and flight.agreement is not None:
             check_one_object(flight.agreement, params.cameras, params.name)
+        if room and not params.metric:
+            centres = read_json(room)["centres_m"]
+            places = {Path(n).name: place for n, place in centres.items() if group_of(n) == PHOTOGRAPHS}
+            raise flight.fall.gravity.known_length(places, params.name)
     draw_flight(output.picture, flight, views, flight.gravity)
     write_json(output.flight, report(flight, views))
     for line in [*flight.offsets_from, flight.gravity]:

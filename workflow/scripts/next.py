@@ -22,6 +22,10 @@ from workflow.stage import run_script
 def main(inputs, output, params, run) -> None:
     use_threads(snakemake.threads)
     settings, lab = IdentifyConfig(**params.identify), NextConfig(**params.next)
+    # Limits and pages are in metres of the room, simulations in those of the box.
+    lab = lab.model_copy(
+        update={key: params.scale * getattr(lab, key) for key in ("max_height", "max_speed")}
+    )
     device, record = choose_device(params.device), read_json(inputs.identified)
     fit, model = read_fit(record, settings), simulator(params.simulation)
     if (friction := recorded_friction(record)) is not None:
@@ -53,7 +57,7 @@ def main(inputs, output, params, run) -> None:
         progress=run.progress,
         log=run.log,
     )
-    written, folder = choice.as_dict(), Path(output.page).parent
+    written, folder = choice.as_dict(params.scale), Path(output.page).parent
     motions = [(option.body, option.path, option.cameras) for option in choice.options[:SHOWN]]
     draw(output.picture, motions, model.dt)
     write_json(output.record, written)

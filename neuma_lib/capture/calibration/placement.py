@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -31,6 +32,11 @@ class Similarity:
             self.scale * first.scale, self.rotation @ first.rotation, self.apply(first.translation[None])[0]
         )
 
+    @staticmethod
+    def read(values: Mapping[str, Any]) -> Similarity:
+        """The similarity of `plain`."""
+        return Similarity(values["scale"], np.array(values["rotation"]), np.array(values["translation"]))
+
     def inverse(self) -> Similarity:
         rotation = self.rotation.T
         return Similarity(1 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
@@ -43,6 +49,7 @@ class Similarity:
         return moved
 
     def plain(self) -> dict:
+        """Entries of a file, read by ``Similarity.read``."""
         return {
             "scale": self.scale,
             "rotation": self.rotation.tolist(),
@@ -182,6 +189,8 @@ def scale_from_length(
 ) -> float:
     """Metres per unit of a reconstruction, from the two ends of a known length in several views.
 
+    In one view, the ends are on the floor at y = 0.
+
     Args:
         viewmats: world to camera of the views, (N, 4, 4).
         directions: x/z and y/z of the ends in each view, (N, 2, 2).
@@ -191,12 +200,17 @@ def scale_from_length(
         InputError: the ends cannot be triangulated.
     """
     views, seen = np.asarray(viewmats), np.asarray(directions)
-    ends = [triangulate(views, seen[:, end])[0] for end in (0, 1)]
+    if len(views) == 1:
+        eye, rays = camera_centres(views)[0], unit_rays(views.repeat(2, axis=0), seen[0])
+        ends = [eye - eye[1] / ray[1] * ray if ray[1] < 0 else np.full(3, np.nan) for ray in rays]
+    else:
+        ends = [triangulate(views, seen[:, end])[0] for end in (0, 1)]
     distance = float(np.linalg.norm(ends[1] - ends[0]))
     if not distance > 0:
         raise InputError(
             "length.ends",
             "the marked points cannot be triangulated",
-            "Mark the same two points, in the same order, in photographs from different sides",
+            "Mark the same two points, in the same order, in photographs from different sides, or two points on the"
+            " floor in one photograph",
         )
     return metres / distance

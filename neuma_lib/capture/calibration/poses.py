@@ -57,6 +57,7 @@ class Poses:
         viewmats: world to camera, (N, 4, 4).
         points: of the scene, (P, 3).
         colours: of the points, (P, 3), uint8.
+        sightings: numbers of the points that each picture shows, N arrays. Empty if unknown.
         error: mean reprojection error [px].
         lost: names of pictures that were not registered.
         unsure: for pictures of fixed cameras with an estimated lens, by name: standard deviations of the principal
@@ -71,6 +72,15 @@ class Poses:
     error: float
     lost: tuple[str, ...] = ()
     unsure: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    sightings: tuple[np.ndarray, ...] = ()
+
+    def seen(self, names: Sequence[str]) -> np.ndarray:
+        """Which points pictures show, Boolean, (len(names), P)."""
+        seen = np.zeros((len(names), len(self.points)), bool)
+        for row, name in zip(seen, names):
+            if self.sightings and name in self.names:
+                row[self.sightings[self.names.index(name)]] = True
+        return seen
 
     def moved(self, by: Similarity) -> Poses:
         """The poses after a similarity of the world."""
@@ -136,6 +146,8 @@ def save_poses(path: str | Path, points: str | Path, poses: Poses) -> None:
         {"name": name, "world_to_camera": viewmat.tolist(), "lens": lens.plain()}
         for name, viewmat, lens in zip(poses.names, poses.viewmats, poses.lenses)
     ]
+    for picture, numbers in zip(pictures, poses.sightings):
+        picture["points"] = numbers.tolist()
     error = poses.error if np.isfinite(poses.error) else None
     summary = {"reprojection_error_px": error, "lost": list(poses.lost), "unsure": dict(poses.unsure)}
     write_json(path, {**summary, "pictures": pictures})
@@ -156,6 +168,7 @@ def load_poses(path: str | Path, points: str | Path) -> Poses:
             np.nan if data["reprojection_error_px"] is None else data["reprojection_error_px"],
             tuple(data["lost"]),
             {name: tuple(values) for name, values in data.get("unsure", {}).items()},
+            tuple(np.array(picture["points"], int) for picture in pictures if "points" in picture),
         )
 
 
@@ -409,7 +422,12 @@ def _poses_of(model: Any, pictures: Mapping[str, Path], lenses: Mapping[str, Len
     for viewmat, name in zip(viewmats, names):
         viewmat[:3] = images[name].cam_from_world().matrix()
         own_lenses.append(lenses.get(group_of(name)) or _lens_of(images[name].camera))
-    points = [model.points3D[number] for number in sorted(model.points3D)]
+    numbers = sorted(model.points3D)
+    points = [model.points3D[number] for number in numbers]
+    sightings = []
+    for name in names:
+        visible = {point.point3D_id for point in images[name].points2D if point.has_point3D()}
+        sightings.append(np.flatnonzero(np.isin(numbers, list(visible))))
     return Poses(
         names,
         tuple(own_lenses),
@@ -418,6 +436,7 @@ def _poses_of(model: Any, pictures: Mapping[str, Path], lenses: Mapping[str, Len
         np.array([point.color for point in points], np.uint8).reshape(-1, 3),
         float(model.compute_mean_reprojection_error()),
         tuple(name for name in pictures if name not in images),
+        sightings=tuple(sightings),
     )
 
 

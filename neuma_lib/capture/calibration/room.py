@@ -9,7 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from neuma_lib.capture.calibration.board import BoardFit, Detection, fit_board, room_from_board
+from neuma_lib.capture.calibration.board import (
+    BoardFit,
+    Detection,
+    corner_positions,
+    fit_board,
+    room_from_board,
+)
 from neuma_lib.capture.calibration.placement import (
     Similarity,
     camera_centres,
@@ -19,12 +25,13 @@ from neuma_lib.capture.calibration.placement import (
 )
 from neuma_lib.capture.calibration.poses import Poses, find_boards
 from neuma_lib.capture.calibration.vertical import MAX_ANGLE, UP, Cue, camera_cues, check_vertical
+from neuma_lib.capture.masks.selection import box_in, locate
 from neuma_lib.capture.pictures import (
     group_of,
     orientation_of,
     picture_name,
-    picture_size,
     read_picture,
+    sensor_pixels,
     undistorted,
     write_png,
 )
@@ -35,8 +42,24 @@ from neuma_lib.project.capture_folder import PHOTOGRAPHS
 
 FLOOR_TOLERANCE = 0.005
 """Distance of near points from the floor, relative to the distance from the cameras to the points."""
+_SUPPORT, _MIN_SUPPORT = (
+    4.0,
+    40,
+)  # distance from a selected object, in half sizes, and number of points on its floor
+_MARK = (
+    1.5,
+    0.001,
+)  # standard deviation of a marked point [px], and as share of the longer side of the photograph
 BOX_MIDDLE = (0.5, 0.0, 0.5)
 """Position of the room's origin, on the floor, in the simulation box [m]."""
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Source of the metre of a room, for messages, and its relative standard deviation. None if it is not known."""
+
+    source: str
+    deviation: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +71,7 @@ class Room:
         room_from_world: from the world of the estimated poses.
         board: fit of the board. None without one.
         floor: share of the points near the fitted floor. None with a board.
+        scale: where the metre comes from. None if the length of the room's unit is unknown.
         cues: upward directions in the room, the one that defines the room's y first.
     """
 
@@ -55,6 +79,7 @@ class Room:
     room_from_world: Similarity
     board: BoardFit | None = None
     floor: float | None = None
+    scale: Scale | None = None
     cues: tuple[Cue, ...] = ()
 
 
@@ -70,18 +95,14 @@ def find_room(poses: Poses, pictures: Mapping[str, Path], settings: CaptureConfi
     cues = camera_cues(poses.viewmats[held], orientations)
     if settings.poses == "photographs":
         placed = {name: pictures[name] for name in poses.names}
-        for file in settings.length.ends if settings.length else ():
-            name = picture_name(PHOTOGRAPHS, file)
-            size = sizes[held.index(poses.names.index(name))] if name in poses.names else None
-            if size and picture_size(pictures[name]) != size:
-                problem = "the photograph is stored turned, so its pixels are not those of the sensor"
-                raise InputError(f"length.ends.{file}", problem, "Mark the points in other photographs")
         boards = find_boards(placed, settings.board) if settings.board else {}
-        room = room_of(poses, boards, settings, cues)
+        turns = dict(zip((poses.names[i] for i in held), orientations))
+        room = room_of(poses, boards, settings, cues, turns)
     else:
         on_board = settings.poses == "board"
         level = room_from_board(settings.board, settings.center) if on_board else Similarity()
-        room = Room(poses.moved(level), level)
+        source = Scale("the board" if on_board else f"the poses in {settings.poses}")
+        room = Room(poses.moved(level), level, scale=source)
     source = "board" if settings.board else "floor" if room.floor is not None else "given poses"
     turned = (replace(cue, up=room.room_from_world.rotation @ cue.up) for cue in cues)
     room = replace(room, cues=(Cue(source, np.array(UP)), *turned))
@@ -90,14 +111,22 @@ def find_room(poses: Poses, pictures: Mapping[str, Path], settings: CaptureConfi
 
 
 def room_of(
-    poses: Poses, detections: Mapping[str, Detection], settings: CaptureConfig, cues: Sequence[Cue] = ()
+    poses: Poses,
+    detections: Mapping[str, Detection],
+    settings: CaptureConfig,
+    cues: Sequence[Cue] = (),
+    orientations: Mapping[str, int | None] | None = None,
 ) -> Room:
     """Make poses metric and upright, by the board, else by a known length and a fitted floor.
+
+    The floor is that under the selected object, if there is one. Without board and length, the unit of the room is the
+    distance from the cameras to the points.
 
     Args:
         poses: of structure from motion.
         detections: corners of the board by picture, unused without a board.
         cues: upward directions in the world of the poses. The first one excludes walls from the search of the floor.
+        orientations: EXIF orientations of photographs by name, for places in their displayed pictures.
 
     Raises:
         InputError: see `fit_board`, `scale_from_length`, `fit_floor`.
@@ -106,35 +135,94 @@ def room_of(
         corners = [detections[name] for name in poses.names]
         fit = fit_board(corners, poses.lenses, poses.viewmats, settings.board)
         room = room_from_board(settings.board, settings.center).after(fit.board_from_world)
-        return Room(poses.moved(room), room, board=fit)
+        spread = np.linalg.norm(np.ptp(corner_positions(settings.board)[fit.corners], axis=0))
+        deviation = fit.residual / (spread * np.sqrt(len(fit.corners)))
+        return Room(poses.moved(room), room, board=fit, scale=Scale("the board", float(deviation)))
     centres = camera_centres(poses.viewmats)
     away = (
         np.median(np.linalg.norm(poses.points - centres.mean(axis=0), axis=1)) if len(poses.points) else 0.0
     )
     level = [cues[0].up, MAX_ANGLE + 2 * cues[0].deviation] if cues else []
-    point, normal, share = fit_floor(poses.points, centres, FLOOR_TOLERANCE * away, settings.seed, *level)
-    middle = np.median(poses.points, axis=0)
+    points, above, middle = poses.points, centres, np.median(poses.points, axis=0)
+    if settings.object and (found := _object(poses, settings, orientations or {})):
+        middle, size = found
+        near = np.linalg.norm(points - middle, axis=1) < _SUPPORT * size
+        if near.sum() >= _MIN_SUPPORT:
+            points, above = points[near], np.concatenate([centres, middle[None]])
+            away = np.median(np.linalg.norm(centres - middle, axis=1))
+    point, normal, share = fit_floor(points, above, FLOOR_TOLERANCE * away, settings.seed, *level)
     level = upright(normal, middle - ((middle - point) @ normal) * normal)
-    scale = _metres_per_unit(poses, settings.length)
+    if settings.length is None:
+        scale, source = 1 / max(away, 1e-12), None
+    else:
+        scale, source = _metres_per_unit(poses.moved(level), settings.length, orientations or {})
     room = Similarity(scale).after(level)
-    return Room(poses.moved(room), room, floor=share)
+    return Room(poses.moved(room), room, floor=share, scale=source)
 
 
-def _metres_per_unit(poses: Poses, length: LengthConfig) -> float:
-    views, directions = [], []
+def _object(
+    poses: Poses, settings: CaptureConfig, orientations: Mapping[str, int | None]
+) -> tuple[np.ndarray, float] | None:
+    """Centre (3,) and half size of the selected object. None if its photographs have no poses."""
+    boxes, Ks = {}, np.stack([lens.pinhole().K for lens in poses.lenses])
+    for file, rectangle in settings.object.items():
+        name = picture_name(PHOTOGRAPHS, file)
+        if name in poses.names:
+            i = poses.names.index(name)
+            boxes[i] = box_in(rectangle, orientations.get(name), poses.lenses[i], Ks[i])
+    if not boxes:
+        return None
+    return locate(poses.viewmats, Ks, boxes, poses.points, poses.seen(poses.names), "object")
+
+
+def _metres_per_unit(
+    poses: Poses, length: LengthConfig, orientations: Mapping[str, int | None]
+) -> tuple[float, Scale]:
+    """Metres per unit of poses whose floor is y = 0, and where they come from.
+
+    Raises:
+        InputError: the named photographs have no poses, or the marks do not determine the length.
+    """
+    stated = length.deviation / length.metres
+    if length.cameras is not None:
+        names = [picture_name(PHOTOGRAPHS, file) for file in length.cameras]
+        if lost := [name for name in names if name not in poses.names]:
+            problem = f"{lost[0]} has no pose"
+            raise InputError("length.cameras", problem, "Remove `length`, and the flight measures it again")
+        a, b = camera_centres(poses.viewmats[[poses.names.index(name) for name in names]])
+        distance = float(np.linalg.norm(a - b))
+        if not distance > 0:
+            raise InputError("length.cameras", "both cameras are at one place", "Name two other photographs")
+        return length.metres / distance, Scale("gravity in the video", stated)
+    views, marks, lenses = [], [], []
     for file, ends in length.ends.items():
         name = picture_name(PHOTOGRAPHS, file)
         if name in poses.names:
             i = poses.names.index(name)
+            lens = poses.lenses[i]
             views.append(poses.viewmats[i])
-            directions.append(poses.lenses[i].directions(np.array(ends)))
-    if len(views) < 2:
+            marks.append(sensor_pixels(np.array(ends), orientations.get(name), (lens.width, lens.height)))
+            lenses.append(lens)
+    required = min(2, len(length.ends))
+    if len(views) < required:
         raise InputError(
             "length.ends",
-            f"{len(views)} of the marked photographs were registered, at least two are required",
+            f"{len(views)} of the marked photographs were registered, at least {required} must be",
             "Mark the points in other photographs",
         )
-    return scale_from_length(views, directions, length.metres)
+
+    def metres_per_unit(shift: np.ndarray) -> float:
+        seen = [lens.directions(mark + by) for lens, mark, by in zip(lenses, marks, shift)]
+        return scale_from_length(views, seen, length.metres)
+
+    still = np.zeros((len(views), 2, 2))
+    scale, variance = metres_per_unit(still), stated**2
+    for place in np.ndindex(still.shape):
+        shift = still.copy()
+        shift[place] = max(_MARK[0], _MARK[1] * max(lenses[0].width, lenses[0].height))
+        variance += (metres_per_unit(shift) / scale - 1) ** 2
+    source = "a length on the floor" if len(views) == 1 else f"a length in {len(views)} photographs"
+    return scale, Scale(source, float(np.sqrt(variance)))
 
 
 def write_room(
@@ -191,6 +279,7 @@ def report(room: Room) -> dict[str, Any]:
         "unsure": {name: list(values) for name, values in poses.unsure.items()},
         "board": room.board.plain() if room.board else None,
         "share_of_points_on_floor": room.floor,
+        "scale": {"source": room.scale.source, "deviation": room.scale.deviation} if room.scale else None,
         "up": [cue.plain() for cue in room.cues],
         "centres_m": dict(zip(poses.names, camera_centres(poses.viewmats).tolist())),
     }

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from neuma_lib.capture.pictures import QUARTER_TURNS
 from neuma_lib.errors import InputError
 
 UP = (0.0, 1.0, 0.0)
@@ -24,8 +25,6 @@ ROLL = 5.0
 """Standard deviation of the roll of a hand-held camera [degrees]."""
 _DEVIATIONS = 2.0  # standard deviations by which an angle must exceed the limit
 _ROUNDS = 5  # of direction and quarter turns in turn
-QUARTER_TURNS = {1: 0, 6: 1, 3: 2, 8: 3}
-"""Clockwise quarter turns after which a stored picture is upright, by EXIF orientation."""
 
 
 @dataclass(frozen=True, eq=False)

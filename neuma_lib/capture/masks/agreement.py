@@ -133,8 +133,8 @@ def nearest_point(centres: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray) -> 
     return point
 
 
-def _projected(points: np.ndarray, viewmat: np.ndarray, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (P, 2), and depth (P,)."""
+def projected(points: np.ndarray, viewmat: np.ndarray, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (P, 2), and depth (P,), of points (P, 3)."""
     seen = points @ viewmat[:3, :3].T + viewmat[:3, 3]
     return (seen[:, :2] / np.maximum(seen[:, 2:], 1e-9)) * K[[0, 1], [0, 1]] + K[:2, 2], seen[:, 2]
 
@@ -153,7 +153,7 @@ def _body(
         seen, inside = np.zeros((2, len(points)), int)
         for mask, viewmat, K in views:
             height, width = mask.shape
-            pixels, depth = _projected(points, viewmat, K)
+            pixels, depth = projected(points, viewmat, K)
             within = (depth > 0) & ((pixels >= 0) & (pixels < (width, height))).all(axis=1)
             x, y = pixels[within].astype(int).T
             seen[within] += 1
@@ -181,7 +181,7 @@ def _silhouette(
 ) -> tuple[np.ndarray, float]:
     """Silhouette with pixels as large as the voxels, and the factor by which the picture (H, W) is reduced."""
     cv2 = opencv()
-    pixels, depth = _projected(points, viewmat, K)
+    pixels, depth = projected(points, viewmat, K)
     shrink = min(1.0, float(np.median(depth)) / (voxel * K[0, 0])) if (depth > 0).all() else 1.0
     width, height = (max(1, round(shrink * n)) for n in size[::-1])
     body = np.zeros((height, width), np.uint8)

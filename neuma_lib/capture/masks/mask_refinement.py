@@ -69,7 +69,8 @@ def refined_masks(
         seen = (body.seen(p.shape[:2], *camera) for p, camera in zip(pictures, zip(viewmats, Ks)))
         candidates = (_view(p, *each) for p, each in zip(pictures, seen))
         views = {i: view for i, view in enumerate(candidates) if view is not None}
-        ratio = _likelihood_ratio(list(views.values()))
+        parts = zip(*((v.pixels[v.certain], v.pixels[~v.possible]) for v in views.values()))
+        ratio = log_ratio(*(colour_shares(np.concatenate(part)) for part in parts))
         for i, view in views.items():
             if kept is None or not kept[i]:
                 refined = _segment(view, ratio, pictures[i].shape[:2])
@@ -80,7 +81,7 @@ def refined_masks(
 
 
 def _segment(view: _View, ratio: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    cost = (-2 * ratio[_bins(view.pixels)]).clip(-UNSEEN, UNSEEN)
+    cost = (-2 * ratio[colour_bins(view.pixels)]).clip(-UNSEEN, UNSEEN)
     cost = np.where(view.certain, -UNSEEN, np.where(view.possible, cost, UNSEEN))
     inside = in_full(component(cheapest(cost, view.pixels.astype(np.float32))), view.box, view.size)
     cv2 = opencv()
@@ -102,16 +103,18 @@ def _view(picture: np.ndarray, body: np.ndarray, voxel: float) -> _View | None:
     return _View(likely.shape, box, pixels, shrunk(likely, band)[box], grown(likely, band)[box])
 
 
-def _bins(pixels: np.ndarray) -> tuple[np.ndarray, ...]:
+def colour_bins(pixels: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Bin of each channel of pixels (..., 3), which index the arrays of `colour_shares`."""
     return tuple(np.moveaxis(pixels.astype(int) * _BINS // 256, -1, 0))
 
 
-def _likelihood_ratio(views: Sequence[_View]) -> np.ndarray:
-    """Logarithm of the ratio of colour frequencies in object and surroundings, by bins of the three channels."""
-    logs = []
-    for parts in ([v.pixels[v.certain] for v in views], [v.pixels[~v.possible] for v in views]):
-        counts = np.zeros((_BINS,) * 3)
-        np.add.at(counts, _bins(np.concatenate(parts)), 1)
-        shares = ndimage.gaussian_filter(counts / max(counts.sum(), 1), _SPREAD, mode="nearest")
-        logs.append(np.log(shares + _FLOOR / _BINS))
-    return logs[0] - logs[1]
+def colour_shares(pixels: np.ndarray) -> np.ndarray:
+    """Smoothed frequencies of the colours of pixels (P, 3), by bins of the three channels. 0 without pixels."""
+    counts = np.zeros((_BINS,) * 3)
+    np.add.at(counts, colour_bins(pixels), 1)
+    return ndimage.gaussian_filter(counts / max(counts.sum(), 1), _SPREAD, mode="nearest")
+
+
+def log_ratio(object_: np.ndarray, surroundings: np.ndarray) -> np.ndarray:
+    """Logarithm of the ratio of two `colour_shares`."""
+    return np.log(object_ + _FLOOR / _BINS) - np.log(surroundings + _FLOOR / _BINS)

@@ -46,7 +46,8 @@ def photograph_mask(
         raise InputError(
             name,
             "the mask is empty, no salient object was detected",
-            "Photograph the object closer and in front of a plain background, leave the picture out, or provide a mask",
+            "Select the object with a box (`object` in capture.yaml), photograph it closer and in front of a plain"
+            " background, leave the picture out, or provide a mask",
         )
     radius = radius_of(likely)
     reach = grown(likely, max(3, round(0.1 * radius)))

@@ -74,6 +74,18 @@ class Filmed:
         rows = self.centroids[:, 1]
         return row_times(self.times, rows, self.row_time, self.masks.shape[1], self.sensor_rows)
 
+    @property
+    def row_delay(self) -> float:
+        """Upper bound of the time between the read-out of opposite edges of the object [s].
+
+        A rolling shutter reads a frame in less than the time between two frames, along the height, or the width if the
+        phone was turned. 0 if its row time is set.
+        """
+        if self.row_time:
+            return 0.0
+        shares = [np.median(self.masks.any(axis=axis).mean(axis=1)) for axis in (1, 2)]
+        return float(np.median(np.diff(self.times)) * max(shares))
+
 
 @dataclass(frozen=True, eq=False)
 class Flight:
@@ -203,6 +215,7 @@ def report(flight: Flight, views: Sequence[Filmed]) -> dict[str, Any]:
         "offsets_s": dict(zip(names, fall.offsets.tolist())),
         "offsets_deviation_s": dict(zip(names, [0.0, *deviations[9:].tolist()])),
         "offsets_from": flight.offsets_from,
+        "row_delay_s": {view.camera: view.row_delay for view in views},
         "spin_rad_s": spin.velocity.tolist() if spin else None,
         "spin_deviation_rad_s": np.sqrt(np.diag(spin.covariance)).tolist() if spin else None,
         "spin_points": spin.points if spin else 0,

@@ -6,7 +6,7 @@ the floor are right. A relative error e of the times appears as 2 e.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -106,6 +106,30 @@ class Gravity:
             causes.append("the videos show different takes or objects")
         causes.append("the frames of free flight include contact, or a hand that holds the object")
         raise InputError(name, self._description(normal), f"Likely causes: {'; '.join(causes)}")
+
+    def known_length(self, places: Mapping[str, Sequence[float]], name: str) -> InputError:
+        """An error that states the length in metres which gravity gives to a room whose unit is unknown.
+
+        Args:
+            places: centres of the cameras of photographs in the room, (3,) each, by file name.
+            name: of the videos.
+        """
+        if not self.several:
+            remedy = "One camera does not measure it. Film with a second camera, or state a length (`length`)"
+            return InputError(name, "the scale is unknown, there is neither a board nor a length", remedy)
+        files, centres = list(places), np.array(list(places.values()))
+        distances = np.linalg.norm(centres[:, None] - centres, axis=-1)
+        a, b = np.unravel_index(distances.argmax(), distances.shape)
+        ratio, deviation = self.ratio
+        metres = float(distances[a, b] / ratio)
+        spread = metres * deviation / ratio
+        return InputError(
+            name,
+            f"the scale is unknown. Gravity in the video gives {metres:.4g} +- {spread:.2g} m between the cameras of"
+            f" {files[a]} and {files[b]}",
+            "Check on the contact sheets that times and frame rate are right, and write into capture.yaml: length:"
+            f" {{metres: {metres:.4g}, deviation: {spread:.2g}, cameras: [{files[a]}, {files[b]}]}}",
+        )
 
     def report(self) -> dict[str, Any]:
         """JSON report. Metres of the room, y up."""

@@ -15,6 +15,7 @@ MAX_RESIDUAL = 0.5
 """Distance of the board's corners from the print for a flat board with the correct square size [mm]."""
 _MAX_UNSURE = 0.3  # standard deviation of a fixed camera's direction [degrees]
 _MAX_TILT = 5.0  # angle between upward directions of different cues [degrees]
+_MAX_SCALE = 0.03  # relative standard deviation of the scale
 _MIN_FLOOR = 0.2  # share of the points on a floor with texture
 _MAX_LEFT_OUT = 0.1  # share of the photographs whose masks disagree with the others
 _MAX_SHIFT = 0.001  # of the background of a fixed camera, as share of the picture
@@ -55,6 +56,12 @@ def checks(room: Mapping[str, Any], videos: Mapping[str, Mapping[str, Any]]) -> 
         text = f"{residual:.2f} mm ({board['corners']} corners, {board['pictures']} pictures)"
         wanted = f"< {MAX_RESIDUAL:g} mm"
         result.append(Check("board's corners off the print", text, wanted, residual < MAX_RESIDUAL))
+    if "scale" in room:
+        scale = room["scale"] or {"source": "unknown, the free flight measures it", "deviation": None}
+        deviation = scale["deviation"]
+        text = scale["source"] + (f" +- {100 * deviation:.1g} %" if deviation is not None else "")
+        good = room["scale"] is not None and (deviation or 0.0) < _MAX_SCALE
+        result.append(Check("scale, from", text, f"< {100 * _MAX_SCALE:g} %", good))
     if (share := room["share_of_points_on_floor"]) is not None:
         text, wanted = f"{100 * share:.0f} % of the points", f"> {100 * _MIN_FLOOR:.0f} %"
         result.append(Check("floor", text, wanted, share > _MIN_FLOOR))

@@ -14,6 +14,7 @@ _MAX_RATIO = 1.5  # of the mean squared errors of held-out and training takes
 _MIN_IOU = 0.8  # mean, of predicted masks with those of the video
 _MAX_OUTSIDE = 0.25  # share of the visited range outside a 95 % band
 _BLUR = 1e-3  # exposure assumed for the size of motion blur, if none is set [s]
+_MAX_SKEW = 2.0  # of the object by a rolling shutter [mm]
 _STRESS_TESTS = {"uniaxial": "stretch", "shear": "shear", "yield": "yielding"}
 
 
@@ -56,6 +57,14 @@ def filming_warnings(capture: Mapping[str, Any], takes: Mapping[str, Mapping[str
                 f"{name}: no exposure is set for {', '.join(unknown)}, so motion blur is neglected. At the maximum "
                 f"speed of {motion['fastest_m_s']:.1f} m/s, an exposure of 1/1000 s blurs the object over {smear:.1f} "
                 "mm."
+            )
+        delays = flight.get("row_delay_s") or {}
+        skew = {c: 1e3 * delay * (motion.get("fastest_m_s") or 0.0) for c, delay in delays.items()}
+        if skewed := {camera: size for camera, size in skew.items() if size > _MAX_SKEW}:
+            listed = ", ".join(f"{size:.1f} mm for {camera}" for camera, size in skewed.items())
+            warnings.append(
+                f"{name}: no row_time is set, so a rolling shutter is neglected. It displaces opposite edges of "
+                f"the object by at most {listed} at the maximum speed of {motion['fastest_m_s']:.1f} m/s."
             )
         for camera, count in (motion.get("frames_after_contact") or {}).items():
             if count < _MIN_FRAMES:
