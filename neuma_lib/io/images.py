@@ -216,6 +216,26 @@ def read_image_set(path: str | Path, views: Sequence[int] | None = None) -> Imag
     return _read_frames(frames, path)
 
 
+def read_labels(path: str | Path) -> np.ndarray:
+    """Numbers of the bodies in the pixels of all images of a transforms.json, 0 for none, shape (K, H, W).
+
+    Raises:
+        InputError: a frame has no label_path, or its image is missing or has another size than the first.
+    """
+    labels, folder = [], Path(path).parent
+    for k, frame in enumerate(_all_frames(path)):
+        if not isinstance(frame.get("label_path"), str):
+            raise InputError(
+                f"{path}: frame {k}", "has no label_path", "Give an image of the bodies' numbers"
+            )
+        file = image_file(folder, frame["label_path"], path)
+        with open_image(read_regular(file), file) as image:
+            labels.append(np.array(image.convert("L")))
+        if labels[-1].shape != labels[0].shape:
+            raise InputError(file, f"has shape {labels[-1].shape}, but the first has {labels[0].shape}")
+    return np.stack(labels)
+
+
 def _all_frames(path: str | Path) -> list[dict[str, Any]]:
     """The frames of a transforms.json, each with the entries common to all."""
     data = read_transforms(path)

@@ -32,8 +32,8 @@ def result_path(settings: Config, name: str, file: str) -> str:
     if base in settings.scenes and settings.scenes[base].bodies:
         raise InputError(
             f"scenes.{base}.bodies",
-            "several bodies are simulated and rendered, but not reconstructed",
-            f"Request files of {settings.data_root.rstrip('/')}/{base}",
+            "several bodies are simulated, rendered and divided, but no method identifies their laws",
+            f"Request files of {settings.data_root.rstrip('/')}/{base}, or gaussians.ply and bodies of its results",
         )
     if base in settings.scenes:
         seeds_used = SEEDS_OF[re.sub("[+]views=[0-9,]+", "", file)]

@@ -101,34 +101,37 @@ def body_functions(dtype: torch.dtype, GridConstants: type) -> SimpleNamespace:
         return vec3(mv[0], mv[1], mv[2]) / mv[3] + c.dt * c.gravity
 
     @wp.func
-    def next_to(c: GridConstants, node: wp.int32, k: wp.int32):
-        """Neighbour k of 27 of a node, of which 13 is itself, or -1 at the end of the grid."""
-        last, place = c.n - 1, node % (c.n * c.n * c.n)
-        x, y, z = place / (c.n * c.n) + k / 9 - 1, place / c.n % c.n + k / 3 % 3 - 1, place % c.n + k % 3 - 1
-        inside = wp.min(x, wp.min(y, z)) >= 0 and wp.max(x, wp.max(y, z)) <= last
-        return wp.where(inside, node - place + (x * c.n + y) * c.n + z, -1)
+    def place_of(c: GridConstants, node: wp.int32):
+        """Indices of a node along the axes."""
+        place = node % (c.n * c.n * c.n)
+        return wp.vec3i(place / (c.n * c.n), place / c.n % c.n, place % c.n)
 
     @wp.func
-    def filter(k: wp.int32):
-        """Weights with which the mass of neighbour k of 27 counts for the gradient and the mean."""
-        steps = vec3(real(k / 9 - 1), real(k / 3 % 3 - 1), real(k % 3 - 1))
-        w = vec3()
-        for axis in range(3):
-            w[axis] = real(0.5) - real(0.25) * wp.abs(steps[axis])
-        half = real(0.5)
-        return vec4(
-            half * steps[0] * w[1] * w[2], half * steps[1] * w[0] * w[2], half * steps[2] * w[0] * w[1],
-            w[0] * w[1] * w[2],
-        )  # fmt: skip
+    def next_to(c: GridConstants, node: wp.int32, place: wp.vec3i, i: wp.int32, j: wp.int32, k: wp.int32):
+        """The node at an offset of -1, 0 or 1 along each axis, or -1 at the end of the grid."""
+        x, y, z = place[0] + i, place[1] + j, place[2] + k
+        inside = wp.min(x, wp.min(y, z)) >= 0 and wp.max(x, wp.max(y, z)) < c.n
+        return wp.where(inside, node + (i * c.n + j) * c.n + k, -1)
+
+    @wp.func
+    def filter(i: wp.int32, j: wp.int32, k: wp.int32):
+        """Weights with which the mass at an offset counts for the gradient and the mean."""
+        x, y, z = real(i), real(j), real(k)
+        half, quarter = real(0.5), real(0.25)
+        w_x, w_y, w_z = half - quarter * wp.abs(x), half - quarter * wp.abs(y), half - quarter * wp.abs(z)
+        return vec4(half * x * w_y * w_z, half * y * w_x * w_z, half * z * w_x * w_y, w_x * w_y * w_z)
 
     @wp.func
     def around(c: GridConstants, grid: wp.array(dtype=vec4), node: wp.int32):
         """Gradient [1/dx] and mean of the mass of a body around a node."""
         total = vec4()
-        for k in range(27):
-            other = next_to(c, node, k)
-            if other >= 0:
-                total += grid[other][3] * filter(k)
+        place = place_of(c, node)
+        for i in range(-1, 2):
+            for j in range(-1, 2):
+                for k in range(-1, 2):
+                    other = next_to(c, node, place, i, j, k)
+                    if other >= 0:
+                        total += grid[other][3] * filter(i, j, k)
         return total
 
     @wp.func
@@ -209,10 +212,13 @@ def body_functions(dtype: torch.dtype, GridConstants: type) -> SimpleNamespace:
         c: GridConstants, node: wp.int32, grad_before: wp.array(dtype=vec4), grad_around: wp.array(dtype=vec4)
     ):
         total = grad_before[node][3]
-        for k in range(27):
-            other = next_to(c, node, k)
-            if other >= 0:
-                total += wp.dot(grad_around[other], filter(26 - k))
+        place = place_of(c, node)
+        for i in range(-1, 2):
+            for j in range(-1, 2):
+                for k in range(-1, 2):
+                    other = next_to(c, node, place, i, j, k)
+                    if other >= 0:
+                        total += wp.dot(grad_around[other], filter(-i, -j, -k))
         return total
 
     return SimpleNamespace(change=change, adjoint=adjoint, mass_gradient=mass_gradient)

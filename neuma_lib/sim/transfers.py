@@ -44,14 +44,15 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
     """Kernels of the forward and of the reverse loop for a precision and features of the model (`forward_kernels`),
     "walls" included, of which a node has a boundary condition, or several bodies."""
     contact, clamps, bodies = "contact" in features, "clamps" in features, "bodies" in features
-    special_nodes = clamps or bodies or "walls" in features
+    special_nodes = clamps or "walls" in features
     Hold, (held, prescribed) = hold_type(dtype), vars(clamp_functions(dtype)).values()
     Obstacle, touching = obstacle_type(dtype), contact_functions(dtype, features)
     touch, touch_adjoint = touching.contact, touching.contact_adjoint
     t, functions = warp_types(dtype), grid_functions(dtype)
     real, vec3, vec4, mat33, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.GridConstants
     obstacle_row = functions.obstacle_row
-    forward, adjoint = forward_functions(dtype, clamps, bodies), adjoint_functions(dtype, clamps, bodies)
+    forward, adjoint = forward_functions(dtype, clamps, False), adjoint_functions(dtype, clamps, bodies)
+    contact_change = body_functions(dtype, GridConstants).change if bodies else None
     hold_mass, update_node, move_particle = forward.hold_mass, forward.update_node, forward.move_particle
     node_adjoint, deformation_adjoint = adjoint.node_adjoint, adjoint.deformation_adjoint
     moved_mask = functions.moved_mask
@@ -252,6 +253,13 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
                         held_by[node] = 0
         else:
             grid_loop(c, spans, grids[0], grids[1])
+        if wp.static(bodies):
+            lines = c.n * c.n
+            for row in range(c.fields * lines):
+                span = (row / lines * 6 + 4) * lines + row % lines
+                for node in range(row * c.n + spans[span], row * c.n + spans[span + lines] + 1):
+                    j = contact_change(c, pairs, grids[0], node)
+                    grids[1, node] = grids[1, node] + vec4(j[0], j[1], j[2], real(0.0))
 
     @kernel
     def g2p(
@@ -374,7 +382,7 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         grad_around: wp.array(dtype=vec4),
     ):
         """As `adjoint_kernels.grid_adjoint`, for the nodes of the spans."""
-        if wp.static(special_nodes):
+        if wp.static(special_nodes or bodies):
             lines = c.n * c.n
             for row in range(c.fields * lines):
                 span = (row / lines * 6 + 4) * lines + row % lines

@@ -23,7 +23,7 @@ from neuma_lib.geometry import shapes
 from neuma_lib.geometry.obstacles import obstacles
 from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.io.gltf import linear
-from neuma_lib.io.images import read_image_set
+from neuma_lib.io.images import read_image_set, read_labels
 from neuma_lib.sim.colliders import Collider
 from neuma_lib.splatting import viewpoints as cameras
 from neuma_lib.splatting.cameras import Cameras
@@ -372,8 +372,7 @@ def test_labels_are_the_visible_objects(tmp_path):
     pile = Several([square(0.4, 0.4), square(0.3, 0.6)])
     views = cameras.video_views(pile.points, 1, 64, 64)
     render_dynamic(pile, views, [0], 1.0, tmp_path, 8)
-    (frame,) = json.loads((tmp_path / "transforms.json").read_text())["frames"]
-    labels = np.array(Image.open(tmp_path / frame["label_path"]))
+    (labels,) = read_labels(tmp_path / "transforms.json")
     mask = read_image_set(tmp_path / "transforms.json").images[0, ..., 3]
     np.testing.assert_array_equal(labels > 0, mask > 127)
     column = int(views.project(np.array([[0.5, 0.5, 0.5]]))[0, 0, 0])
@@ -383,3 +382,5 @@ def test_labels_are_the_visible_objects(tmp_path):
         assert labels[int(row - 1.5), column] == above and labels[int(row + 1.5), column] == below
     render_dynamic(pile.bodies[0], views, [0], 1.0, tmp_path / "one", 8)
     assert not (tmp_path / "one" / "labels").exists()
+    with refused("frame 0", problem="label_path"):
+        read_labels(tmp_path / "one" / "transforms.json")

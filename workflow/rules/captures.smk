@@ -28,7 +28,7 @@ VIDEO_FRAMES = f"{RESULTS}/{{capture}}/frames/{VIDEO}"
 FLIGHT = f"{RESULTS}/{{capture}}/flight/{{take}}"
 
 # Names of folders with other results.
-OTHERS = "|".join([TRUE_SCENE, SPLAT_SCENE, *RESERVED])
+OTHERS = "|".join([TRUE_SCENE, PILE_SCENE, SPLAT_SCENE, *RESERVED])
 RELEASED_CAPTURE = names_of(SETTINGS.captures.released, replicates=False)
 OWN_CAPTURE = f"(?!({OTHERS}|{RELEASED_CAPTURE})/){NAME.pattern}"
 RELEASED_TAKE = scenes_that(

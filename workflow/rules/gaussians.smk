@@ -19,3 +19,19 @@ rule gaussians:
         device=SETTINGS.device,
     script:
         "../scripts/gaussians.py"
+
+
+rule body_gaussians:
+    input:
+        kernels=kernels("rendering"),
+        gaussians=f"{RESULTS}/{{scene}}/gaussians.ply",
+        transforms=of_data("static/transforms.json"),
+    output:
+        gaussians=f"{RESULTS}/{{scene}}/bodies/{{body}}.ply",
+    wildcard_constraints:
+        scene=PILE_SCENE,
+        body="[^/]+",
+    params:
+        bodies=of_section(lambda scene: list(scene.bodies)),
+    script:
+        "../scripts/body_gaussians.py"

@@ -102,6 +102,7 @@ def scenes_that(holds, replicates=True):
 
 # Scenes of captures and of splats have no truth. Takes have the body and the motion from registration.
 TRUE_SCENE = scenes_that(lambda scene: scene.has_truth)
+PILE_SCENE = scenes_that(lambda scene: scene.bodies)
 SPLAT_SCENE = scenes_that(lambda scene: scene.splat)
 OBJECT_SCENE = scenes_that(lambda scene: not (scene.captured and scene.captured.throw))
 PICTURED_SCENE = scenes_that(lambda scene: not scene.splat and not (scene.captured and scene.captured.throw))
