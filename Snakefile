@@ -28,8 +28,10 @@ include: "workflow/rules/splats.smk"
 include: "workflow/rules/experiments.smk"
 include: "workflow/rules/calibration.smk"
 include: "workflow/rules/stress.smk"
+include: "workflow/rules/specimens.smk"
 include: "workflow/rules/law_export.smk"
 include: "workflow/rules/demo.smk"
+include: "workflow/rules/stills.smk"
 include: "workflow/rules/metrics.smk"
 include: "workflow/rules/paper.smk"
 include: "workflow/rules/figure_table.smk"
@@ -53,6 +55,13 @@ if workflow.is_main_process and Path(workflow.main_snakefile).resolve() == ROOT 
     checked(refuse_unknown)(
         requested_targets(),
         workflow.rules,
-        [*SETTINGS.scenes, *SETTINGS.methods, *SETTINGS.experiments, *SETTINGS.priors.laws, *tables],
+        [
+            *SETTINGS.scenes,
+            *SETTINGS.methods,
+            *SETTINGS.experiments,
+            *SETTINGS.specimens,
+            *SETTINGS.priors.laws,
+            *tables,
+        ],
         missing_settings,
     )

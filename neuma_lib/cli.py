@@ -462,19 +462,16 @@ def _export_to_engine(options: argparse.Namespace, law: Law, known: dict[str, An
         raise InputError("--engine", "has no --weight, --page or --separate", "Leave them out")
     own = {name: getattr(options, name) for name in ("density", "substep", "fit", "force", "world")}
     material, about = law_for_engine(law, known, engine, states=_visited_states(known), **own)
-    write_law_scene(options.target, engine, material, about)
-    _print_material(options.target, material, about)
+    _print_material(options.target, material, write_law_scene(options.target, engine, material, about))
 
 
-def _print_material(target: str, material: Any, about: dict[str, Any]) -> None:
+def _print_material(target: str, material: Any, notes: list[str]) -> None:
     arguments = ", ".join(
         f"{key} = {value if isinstance(value, (str, bool)) else format(value, '.4g')}"
         for key, value in material.arguments.items()
     )
     print(f"{target}: {material.kind}, {arguments}")
-    for name, error in (about["fit"] or {}).items():
-        print(f"stress error of the fit over the visited states ({name}): {100 * error:.1f} %")
-    for note in material.notes:
+    for note in notes:
         print(f"note: {note}")
 
 
@@ -521,7 +518,7 @@ def _scene_export(options: argparse.Namespace) -> None:
         states=_visited_states(known),
     )  # fmt: skip
     notes = export_scene(options.target, options.engine, own, about["law"], {**about, "scale": scale or 1.0})
-    _print_material(options.target, material._replace(notes=tuple(notes)), about)
+    _print_material(options.target, material, notes)
     print(f"Play it with: python {options.target}/run.py")
 
 

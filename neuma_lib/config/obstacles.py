@@ -96,11 +96,22 @@ class ColliderConfig(Section):
         return given | ({"rotation": list(self.start[1])} if self.axis != UP else {})
 
 
-class ClampConfig(Section):
-    """A region of the body that follows a prescribed motion, or is held in place."""
+class RegionConfig(Section):
+    """A box-shaped part of a body."""
 
     lowest: Vector = Field(description="corner of the region at t = 0 [m]")
     highest: Vector = Field(description="opposite corner, larger on every axis [m]")
+
+    @model_validator(mode="after")
+    def _region_is_whole(self) -> RegionConfig:
+        if not all(low < high for low, high in zip(self.lowest, self.highest, strict=True)):
+            raise InputError("highest", f"{list(self.highest)} must exceed lowest on every axis")
+        return self
+
+
+class ClampConfig(RegionConfig):
+    """A region of the body that follows a prescribed motion, or is held in place."""
+
     release: float | None = Field(
         None, gt=0, description="time from which on it moves freely [s]; null: never"
     )
@@ -109,9 +120,7 @@ class ClampConfig(Section):
     )
 
     @model_validator(mode="after")
-    def _region_is_whole(self) -> ClampConfig:
-        if not all(low < high for low, high in zip(self.lowest, self.highest, strict=True)):
-            raise InputError("highest", f"{list(self.highest)} must exceed lowest on every axis")
+    def _times_ascend(self) -> ClampConfig:
         _check_times(self.keyframes)
         return self
 

@@ -18,7 +18,7 @@ from neuma_lib.io.mjcf import read_elasticity
 from neuma_lib.io.usd_particles import read_material
 from neuma_lib.mechanics.adaptor import AdaptableLaw
 from neuma_lib.mechanics.analytic import analytic_law, specification
-from neuma_lib.mechanics.catalogue import ELASTICITY, PLASTICITY, VISCOSITY
+from neuma_lib.mechanics.catalogue import at_length_scale
 from neuma_lib.mechanics.law import Law
 from neuma_lib.mechanics.structured import StructuredLaw
 
@@ -71,7 +71,7 @@ def law_for_engine(
         problem = f"a metre of its simulator is {1 / scale:.4g} m of the filmed world, which has other moduli"
         raise InputError(f"law {law.name}", problem, "Convert it with --world, or export the scene")
     if scale != 1.0:
-        spec = _of_world(spec, scale)
+        spec = at_length_scale(spec, 1 / scale)
     about = {**known, "law": spec, "density": density, "substep": substep, "scale": 1.0, "fit": errors}
     if fit or world:  # other constants than those that were estimated
         about["constants"] = None
@@ -133,19 +133,3 @@ def _fitted(law: Law, known, engine: str, states: Tensor | None, force: bool, su
             f"law {law.name}", f"{problem}, {limit}", "Accept it with --force, or choose another engine"
         )
     return fit.spec, fit.errors
-
-
-def _of_world(spec: Mapping[str, Any], scale: float) -> dict[str, Any]:
-    """A law with constants of the filmed world: stresses and viscosities at the same density scale with length^2."""
-    known = {"elasticity": ELASTICITY, "plasticity": PLASTICITY, "viscosity": VISCOSITY}
-
-    def unit(part: str, name: str, key: str) -> str:
-        return known[part][name][key].unit if key in known[part][name] else ""
-
-    return {
-        part: {
-            key: value / scale**2 if "Pa" in unit(part, values["name"], key) else value
-            for key, value in values.items()
-        }
-        for part, values in spec.items()
-    }

@@ -18,6 +18,8 @@ from neuma_lib.mechanics.catalogue import ELASTICITY, PLASTICITY, check_constant
 ENGINES = ("genesis", "newton", "mujoco")
 UNBOUNDED = 1e12
 """Yield stress of a newton material that never yields, and pressure at which it is crushed [Pa]."""
+MAX_RELAXATION = 0.01
+"""Longest relaxation time of the shear of a viscous law that a fluid without elastic shear replaces [s]."""
 _SAME_MODULI = 1e-6
 """Relative difference up to which moduli of both parts of a law are equal."""
 
@@ -102,7 +104,7 @@ def _positive(name: str, value: Any, unit: str) -> float:
 
 
 def _refusal(engine: str, names: Names, constants: Values) -> str | None:
-    """Why an engine does not have a law, or None."""
+    """Why an engine does not have a law with these constants, or None."""
     if names not in RULES[engine]:
         return f"it has {', '.join(map(' + '.join, RULES[engine]))}"
     able, problem = _LIMITS.get((engine, names[1]), (lambda c: True, None))
@@ -214,7 +216,10 @@ RULES: dict[str, dict[Names, Callable[[Values, float], tuple[Any, ...]]]] = {
 _LIMITS: dict[Names, tuple[Callable[[Values], bool], str]] = {
     ("genesis", "von_mises"): (lambda c: c["yield_stress"] > 0, "its yield_stress must be greater than 0 Pa"),
     ("genesis", "drucker_prager"): (lambda c: c["cohesion"] == 0, "MPM.Sand has no cohesion"),
-    ("genesis", "viscous_flow"): (lambda c: c["yield_stress"] == 0, "MPM.Liquid has no yield stress"),
+    ("genesis", "viscous_flow"): (
+        lambda c: c["yield_stress"] == 0 and c["viscosity"] <= MAX_RELAXATION * lame(c["E"], c["nu"])[0],
+        f"MPM.Liquid has no yield stress and no elastic shear that relaxes in more than {MAX_RELAXATION:g} s",
+    ),
     ("newton", "cohesive_drucker_prager"): (
         lambda c: c["dilation_angle"] == 0,
         "the dilatancy of newton is not the dilation angle",

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from neuma_lib.errors import InputError
 from neuma_lib.evaluation.material_point import returned, stress
-from neuma_lib.export.materials import RULES, check_engine
+from neuma_lib.export.materials import RULES, check_engine, engine_material
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.law import Law
 
@@ -78,8 +78,8 @@ def nearest(law: Law, states: Tensor, engine: str, dt: float) -> Fit:
         )
     trial = trial_states(F)
     after = stress(law, returned(law, trial))
-    fits = [_fit(names, F, tau, trial, after, dt) for names in RULES[engine]]
-    able = [fit for fit in fits if fit is not None]
+    fits = [_fit(engine, names, F, tau, trial, after, dt) for names in RULES[engine]]
+    able = [fit for fit in fits if fit is not None and _has(engine, fit.spec, dt)]
     enough = min(fit.error for fit in able) + 0.01  # a simpler law is preferred to 1 % of the stress
     return min(
         (fit for fit in able if fit.error <= enough), key=lambda fit: (len(fit.spec["plasticity"]), fit.error)
@@ -112,7 +112,7 @@ def sampled_states(visited: Mapping[str, Any], count: int = 2000, seed: int = 0)
     return torch.from_numpy((U * np.exp(logs[inside][:count])[:, None]) @ V.transpose(0, 2, 1))
 
 
-def _fit(names, F: Tensor, tau: Tensor, trial: Tensor, after: Tensor, dt: float) -> Fit | None:
+def _fit(engine: str, names, F: Tensor, tau: Tensor, trial: Tensor, after: Tensor, dt: float) -> Fit | None:
     """Fit one family, or None if it is not fitted."""
     elastic, plastic = names
     if plastic not in _STARTS:
@@ -136,6 +136,8 @@ def _fit(names, F: Tensor, tau: Tensor, trial: Tensor, after: Tensor, dt: float)
     starts = {
         key: [max(value * scales[key], 1e-9) for value in values] for key, values in _STARTS[plastic].items()
     }
+    if (engine, plastic) == ("genesis", "viscous_flow"):
+        starts.pop("yield_stress")
 
     def spec(logs) -> dict[str, Any]:
         constants = dict(zip(starts, np.exp(logs).tolist(), strict=True))
@@ -154,6 +156,14 @@ def _fit(names, F: Tensor, tau: Tensor, trial: Tensor, after: Tensor, dt: float)
         best = minimize(error, start, method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-5}).x
     own = analytic_law(spec(best), dt)
     return Fit(spec(best), {"stress": _relative(stress(own, F), tau), "returned": error(best)})
+
+
+def _has(engine: str, spec: Mapping[str, Any], dt: float) -> bool:
+    """Whether an engine has a law with these constants."""
+    try:
+        return bool(engine_material(spec, 1.0, dt, engine))
+    except InputError:
+        return False
 
 
 def _relative(values: Tensor, true: Tensor) -> float:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import permutations
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +36,8 @@ STICKS = 1e3
 """Coulomb coefficient of a floor on which nothing slides."""
 SAMPLE_EDGE, SAMPLE_COUNT, SAMPLE_HEIGHT = 0.2, 16, 0.1
 """Edge [m], particles along it, and height above the floor [m] of the cube in the file of a law alone."""
+_KUHN = np.array([[0, 4, 6, 7], [0, 5, 4, 7], [0, 6, 2, 7], [0, 2, 3, 7], [0, 1, 5, 7], [0, 3, 1, 7]])
+"""Six tetrahedra of a cube whose corners are numbered by 4 i + 2 j + k, positively oriented (Kuhn 1960)."""
 
 
 @dataclass(frozen=True)
@@ -119,8 +120,10 @@ class EngineScene:
 
 def write_law_scene(
     path: str | Path, engine: str, material: EngineMaterial, about: Mapping[str, Any]
-) -> None:
-    """Write a file that the engine loads: ``.usda`` or ``.xml`` of a falling cube, or ``.json`` of the material alone.
+) -> list[str]:
+    """Write a file that the engine loads, ``.usda`` or ``.xml`` of a falling cube, or ``.json`` of the material alone.
+
+    Returns the notes.
 
     Args:
         about: as of `neuma_lib.export.laws.law_for_engine`.
@@ -139,6 +142,7 @@ def write_law_scene(
     else:
         wanted = " or ".join(dict.fromkeys((".json", own)))
         raise InputError(path, f"{engine} reads {wanted}", "Give the file that suffix")
+    return content["notes"]
 
 
 def export_scene(
@@ -187,6 +191,9 @@ def _about(engine: str, material: EngineMaterial, about: Mapping[str, Any]) -> d
     grid = about.get("grid")
     fitted = f"fitted on a grid of {grid} cells, whose error they contain"
     notes = [*material.notes, f"constants {'of the material' if grid is None else fitted}", CONTACT]
+    if errors := about.get("fit"):
+        percent = " and after the return map ".join(f"{100 * error:.1f} %" for error in errors.values())
+        notes.insert(0, f"nearest law of {engine}: stress error of the fit over the visited states {percent}")
     keys = ("law", "constants", "density", "scale", "substep", "fit", "scene", "method", "commit")
     return {
         "engine": engine,
@@ -229,24 +236,11 @@ def _mesh(scene: EngineScene) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nd
     corners = cells[:, None] + np.indices((2, 2, 2)).reshape(3, 8).T
     sites, index = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
     index = index.reshape(len(cells), 8)
-    tetrahedra = np.concatenate([index[:, corner] for corner in _KUHN])
+    tetrahedra = index[:, _KUHN].reshape(-1, 4)
     share = scene.mass.sum() / len(tetrahedra) / 4
     masses = np.bincount(tetrahedra.ravel(), minlength=len(sites)) * share
     vertices = lowest + cell * sites
     return vertices, tetrahedra, masses, scene.v[cKDTree(scene.x).query(vertices)[1]], cell
-
-
-def _kuhn() -> list[list[int]]:
-    """Six tetrahedra of a cube whose corners are numbered by 4 i + 2 j + k, positively oriented (Kuhn 1960)."""
-    result = []
-    for order in permutations((4, 2, 1)):
-        path = np.cumsum([0, *order]).tolist()
-        even = order in ((4, 2, 1), (2, 1, 4), (1, 4, 2))
-        result.append(path if even else [path[0], path[2], path[1], path[3]])
-    return result
-
-
-_KUHN = _kuhn()
 
 
 def _colors(x: np.ndarray, gaussians: Gaussians) -> np.ndarray:

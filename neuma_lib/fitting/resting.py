@@ -23,6 +23,7 @@ from skimage.measure import find_contours
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.fitting.least_squares import Linearisation, levenberg_marquardt
 from neuma_lib.geometry.outline import Outline, outline, silhouette
+from neuma_lib.io.datasets.stills import Still
 from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.clamps import Clamp
 from neuma_lib.sim.equilibrium import Equilibrium, solve_equilibrium
@@ -46,36 +47,26 @@ _ROUNDS = 4  # after each of which points near hidden parts are chosen again
 _MAX_STEP = 3.0
 
 
-@dataclass(frozen=True, eq=False)
-class Still:
-    """A photograph of a body at rest.
+def contours(mask: NDArray[np.bool_]) -> list[Array]:
+    """Closed contours of a mask (H, W) with holes, shape (n, 2) each [px], pixel centres at half integers."""
+    lines = find_contours(np.pad(mask, 1).astype(float), 0.5)
+    return [line[:, ::-1] - 0.5 for line in lines]  # padding, and half a pixel
 
-    Attributes:
-        mask: of the body, shape (H, W).
-        K: intrinsics, pixel centres at half integers, shape (3, 3) [px].
-        marker: corners in the marker's frame, y up, shape (M, 3) [m].
-        marker_pixels: shape (M, 2) [px].
+
+def contour(mask: NDArray[np.bool_]) -> Array:
+    """Points of the longest contour of a mask (H, W) at equal distances, shape (C, 2) [px].
+
+    Raises:
+        InputError: the mask is empty.
     """
-
-    mask: NDArray[np.bool_]
-    K: Array
-    marker: Array
-    marker_pixels: Array
-
-    def contour(self) -> Array:
-        """Points of the longest contour of the mask at equal distances, shape (C, 2) [px].
-
-        Raises:
-            InputError: the mask is empty.
-        """
-        lines = find_contours(np.pad(self.mask, 1).astype(float), 0.5)
-        if not lines:
-            raise InputError("mask", "shows no body")
-        line = max(lines, key=len)[:, ::-1] - 0.5  # padding and half a pixel
-        reached = np.concatenate([[0], np.linalg.norm(np.diff(line, axis=0), axis=1).cumsum()])
-        count = max(4, round(reached[-1] / _SPACING))
-        sites = np.arange(count) * reached[-1] / count
-        return np.stack([np.interp(sites, reached, line[:, axis]) for axis in (0, 1)], axis=1)
+    lines = contours(mask)
+    if not lines:
+        raise InputError("mask", "shows no body")
+    line = max(lines, key=len)
+    reached = np.concatenate([[0], np.linalg.norm(np.diff(line, axis=0), axis=1).cumsum()])
+    count = max(4, round(reached[-1] / _SPACING))
+    sites = np.arange(count) * reached[-1] / count
+    return np.stack([np.interp(sites, reached, line[:, axis]) for axis in (0, 1)], axis=1)
 
 
 @dataclass(eq=False)
@@ -172,7 +163,7 @@ class StillResiduals:
         self.start = pose, placement, ratio
         self.scales = _SCALES * np.where(np.arange(10) // 3 == 2, placement_std, 1.0)
         self.scales[RATIO] = _SCALES[RATIO]
-        self.contour = still.contour()
+        self.contour = contour(still.mask)
         step = np.linalg.norm(self.contour[1] - self.contour[0])
         self.weight = math.sqrt(step / _CORRELATED) / _CONTOUR_NOISE
         self.visible = np.ones(len(self.contour), dtype=bool)
@@ -365,7 +356,7 @@ def _result(
     covariance[inner] = np.linalg.inv((fit.curvature + _prior(fit))[inner])
     independent = residuals.visible.sum() * (residuals.weight * _CONTOUR_NOISE) ** 2 + 2 * len(still.marker)
     misfit = max(1.0, cost / max(1.0, independent - len(free) + 3))  # the prior adds three values
-    std = residuals.scales * np.sqrt(misfit * covariance.diagonal())
+    std = np.asarray(residuals.scales * np.sqrt(misfit * np.diag(covariance)), dtype=np.float64)
     distance = residuals.distances(u)[residuals.visible]
     corners = residuals._corners(u)[0] * _MARKER_NOISE
     _, pixels, _ = residuals.surface(u)

@@ -229,6 +229,22 @@ def check_constants(
     return numbers
 
 
+def at_length_scale(spec: Mapping[str, Any], scale: float) -> dict[str, Any]:
+    """A law in a world whose lengths are ``scale`` times as long, at the same densities and times.
+
+    Stresses and viscosities scale with length^2.
+    """
+    return {
+        part: {
+            key: value * scale**2
+            if key in PARTS[part][values["name"]] and "Pa" in PARTS[part][values["name"]][key].unit
+            else value
+            for key, value in values.items()
+        }
+        for part, values in spec.items()
+    }
+
+
 def lame(E, nu):
     """Lamé parameters mu, lam [Pa] of Young's modulus E [Pa] and Poisson's ratio nu, numbers or tensors."""
     return E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu))

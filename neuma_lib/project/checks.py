@@ -89,6 +89,8 @@ def _laws(settings: Config) -> Iterator[tuple[str, dict[str, Any]]]:
         yield f"priors.laws.{name}", law.plain()
     for name, law in settings.identify.families.items():
         yield f"identify.families.{name}", law.plain()
+    for name, specimen in settings.specimens.items():
+        yield f"specimens.{name}.law", specimen.law.plain()
     for name, family in settings.pac_nerf.families.items():
         yield f"pac_nerf.families.{name}", family.plain()
     for group in ("families", "outside"):

@@ -29,6 +29,8 @@ from neuma_lib.config.photographs import PhotographsConfig
 from neuma_lib.config.priors import PriorsConfig
 from neuma_lib.config.scenes import PairConfig, SceneConfig
 from neuma_lib.config.simulation import GRAVITY, SimulationConfig
+from neuma_lib.config.specimens import SpecimenConfig
+from neuma_lib.config.stills import StillsConfig
 from neuma_lib.config.structured import StructuredConfig
 from neuma_lib.config.tables import TableConfig
 from neuma_lib.config.training import TrainingConfig
@@ -81,6 +83,7 @@ class Config(Section):
     springs: SpringsConfig = Field(SpringsConfig(), description="bodies of springs")
     pac_nerf: PacNerfConfig = Field(PacNerfConfig(), description="velocity and constants of PAC-NeRF")
     captures: CapturesConfig = Field(CapturesConfig(), description="own photographs and videos")
+    stills: StillsConfig = Field(StillsConfig(), description="bodies at rest in photographs")
     evaluation: EvaluationConfig = Field(EvaluationConfig(), description="measures and videos")
     viewer: ViewerConfig = Field(ViewerConfig(), description="viewer in a file")
     exports: ExportsConfig = Field(ExportsConfig(), description="motions for other programs")
@@ -90,6 +93,7 @@ class Config(Section):
         {}, description="presets of methods by name, in addition to the built-in"
     )
     experiments: dict[str, ExperimentConfig] = Field({}, description="uses of learned laws by name")
+    specimens: dict[str, SpecimenConfig] = Field({}, description="tests on clamped beams by name")
     tables: dict[str, TableConfig] = Field({}, description="tables by name")
 
     def replicate(self, name: str) -> tuple[str, dict[str, int]]:

@@ -13,6 +13,7 @@ import pytest
 import torch
 
 import neuma_lib as nm
+from benchmarks import engine_schemes
 from neuma_lib.cli import main
 from neuma_lib.evaluation.material_point import returned, stress
 from neuma_lib.export.materials import RULES, engine_material
@@ -265,6 +266,17 @@ def test_the_beam_of_finite_elements_sags_as_in_mpm(tmp_path):
 
 
 # Scenes
+
+
+@pytest.mark.parametrize("names", [("hencky",), ("hencky", "von_mises")], ids=" + ".join)
+def test_the_slow_scheme_with_our_choices_is_ours(names):
+    scene, spec = replace(moving_cube(), steps=40, every=40), spec_of(*names)
+    own = our_motion(scene, spec)
+    x = engine_schemes.simulate(scene, analytic_law(spec, DT))
+    assert np.abs(own[-1] - own[0]).max() > 1e-3
+    np.testing.assert_allclose(x, own[-1], atol=1e-6)
+    other = engine_schemes.simulate(scene, analytic_law(spec, DT), gradient=True, trilinear=True)
+    assert np.abs(other - x).max() > 1e-5
 
 
 @pytest.mark.core

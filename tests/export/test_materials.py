@@ -197,6 +197,12 @@ def test_a_fit_finds_the_small_strain_moduli_of_another_family():
     assert fit.spec["elasticity"]["E"] == pytest.approx(MODULI["E"], rel=0.02)
 
 
+@pytest.mark.parametrize("engine", ENGINES)
+def test_every_nearest_law_can_be_exported(engine):
+    fit = nearest(analytic_law(spec_of("hencky")), torch.from_numpy(states(300, 0.15)), engine, DT)
+    engine_material(fit.spec, RHO, DT, engine)
+
+
 def test_trial_states_and_samples_stay_near_the_visited_ones():
     visited = {"stretch": [0.8, 1.15], "shear": [-0.2, 0.2], "pressed": 0.9}
     F = sampled_states(visited)

@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from neuma_lib.errors import NonFiniteError
 from neuma_lib.fitting.resting import StillResiduals, fit_still
+from neuma_lib.sim.equilibrium import extrapolated
 from tests.support import hanging_beam as beam
 from tests.support.errors import refused
 
@@ -77,3 +78,17 @@ def test_stills_without_a_body_are_refused(still):
         )
     with pytest.raises(NonFiniteError, match="in front of the camera"):
         fit_still(still, coarse, [behind], beam.PLACEMENT, 0.004, 93.0)
+
+
+@pytest.mark.slow
+def test_the_twin_in_blender_has_its_stiffness(tmp_path):
+    """Same camera, clamp and size as the recording, rendered by another program, with a box in front of the root."""
+    pytest.importorskip("bpy")
+    mask = beam.filmed(beam.resting_beam(0.015), 93.0, tmp_path)
+    drawn = beam.image_of(beam.resting_beam(0.015), 93.0)
+    assert 0.02 < 1 - mask.sum() / drawn.sum() < 0.4 and not (mask & ~drawn).sum() > 0.01 * mask.sum()
+    meshes = [beam.resting_beam(size) for size in (0.03, 0.015)]
+    fits = [fit_still(beam.observe(mask), body, [moved()], beam.PLACEMENT, 0.004, 60.0) for body in meshes]
+    ratio = np.exp(extrapolated(*(np.log(fit.ratio) for fit in fits), 2.0))
+    assert ratio == pytest.approx(93.0, rel=0.05)
+    assert fits[1].contour_rms < 1 and fits[1].iou > 0.97

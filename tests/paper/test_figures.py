@@ -173,6 +173,13 @@ DATA = {
         row_titles=["JellyStair", "ClayPress", "SandGlass"],
         column_titles=[""] * 4,
     ),
+    "stills": lambda: pictures(
+        3,
+        3,
+        {},
+        row_titles=["Mold Star beam\nclamp 7 cm\nμ/ρ 93 m²/s²\n1.1 px, IoU 0.970"] * 3,
+        column_titles=["Photograph", "Prediction", "Difference"],
+    ),
     "gradient_analysis": lambda: {
         scene: {
             "norms": {"elastic": curves(50), "plastic": curves(50)},

@@ -1,14 +1,21 @@
 """The experiment of docs/results/silicone.md with a known beam: same size, camera and clamp."""
 
+import json
+
 import numpy as np
 import trimesh
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from neuma_lib.fitting.resting import RestingBody, Still, StillResiduals
+from neuma_lib.data.blender.scene import Surface, render_images
+from neuma_lib.fitting.resting import RestingBody, StillResiduals
 from neuma_lib.geometry.blocks import hexahedra
+from neuma_lib.geometry.obstacles import Obstacle
 from neuma_lib.geometry.outline import silhouette
+from neuma_lib.io.datasets.stills import Still
 from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.clamps import Clamp
+from neuma_lib.splatting.viewpoints import Views
 
 CLAMP, HIDDEN, PLACEMENT = 0.07, 0.05, np.array([-0.09, -0.036, -0.016])
 K = np.array([[903.7, 0.0, 640.0], [0.0, 903.7, 360.0], [0.0, 0.0, 1.0]])
@@ -55,3 +62,33 @@ def image_of(beam, ratio):
     empty[:2, :2] = True  # any contour
     residuals = StillResiduals(observe(empty), beam, POSE, PLACEMENT, 0.004, ratio)
     return silhouette(residuals.surface(np.zeros(10))[1], beam.triangles, HEIGHT, WIDTH)
+
+
+def filmed(beam, ratio, folder):
+    """Mask (HEIGHT, WIDTH) of the beam at rest with mu / rho, rendered by Blender, with its root behind a box."""
+    x = beam.weights @ beam.at_rest(ratio).x + PLACEMENT
+    x[:, 1] += 1.0  # above Blender's floor
+    high = POSE @ np.block([[np.eye(3), np.array([[0.0], [-1.0], [0.0]])], [np.zeros(3), 1.0]])
+    views = Views(np.linalg.inv(high)[None] @ np.diag([1.0, -1.0, -1.0, 1.0]), K[0, 0], WIDTH, HEIGHT)
+    box = trimesh.creation.box((0.05, 0.08, 0.05)).apply_translation(PLACEMENT + [0.085, 1.0, 0.0])
+    hides = Obstacle(np.asarray(box.vertices), np.asarray(box.faces), np.eye(4)[None], (0.9, 0.9, 0.9))
+    surface = Surface(x[None], beam.triangles, np.full_like(x, 0.5))
+    render_images(surface, views, [(0, 0)], folder, ["beam.png"], samples=8, obstacles=[hides])
+    with Image.open(folder / "beam.png") as image:
+        return np.asarray(image)[..., 3] > 127
+
+
+def write_record(root, masks, record="twin"):
+    """A folder for `neuma_lib.io.datasets.stills`. Photographs are the masks, the mesh is in centimetres."""
+    frames = []
+    for k, mask in enumerate(masks):
+        Image.fromarray(np.uint8(255 * mask)).save(root / f"mask_{k}.png")
+        corners = (observe(mask, k + 1).marker_pixels - 0.5).tolist()
+        frames.append({"file": f"mask_{k}.png", "mask": f"mask_{k}.png", "marker_corners_px": corners})
+    (root / "frames.json").write_text(json.dumps({record: {"frames": frames}}))
+    camera = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2] - 0.5, "cy": K[1, 2] - 0.5}
+    calibration = {"colour": camera, "marker": {"side_m": 0.02}}
+    (root / "calibration.json").write_text(json.dumps(calibration))
+    mesh = dumbbell()
+    mesh.apply_scale(100.0)
+    mesh.export(root / "beam.obj")

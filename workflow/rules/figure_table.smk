@@ -385,6 +385,16 @@ FIGURES = {
         },
         "resources": {"runtime": 60},
     },
+    "stills": {
+        "kind": "h5",
+        "input": {
+            "results": checked(lambda wildcards: resting_results()),
+            "photographs": checked(lambda wildcards: resting_pictures("file")),
+            "masks": checked(lambda wildcards: resting_pictures("mask")),
+        },
+        "params": {"titles": RESTING_TITLES, "photographs": RESTING.photographs},
+        "default_target": False,
+    },
     "material_response": {
         "kind": "json",
         "input": {"responses": [f"{RESULTS}/{run}/response.json" for *_, runs in RESPONSES for run in runs]},

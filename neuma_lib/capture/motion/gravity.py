@@ -95,7 +95,9 @@ class Gravity:
             return line if mismatch <= _MAX_MISMATCH else f"{line}; {_UNDECIDED}"
         causes = []
         if abs(ratio - 1) > _MAX_MISMATCH / 2:
-            causes.append(f"the board's square size is {1 / ratio:.2f} of the given one (measure it)")
+            causes.append(
+                f"the board's square size is {1 / ratio:.2f} of the given one, or `length` is (measure it)"
+            )
             causes.append(
                 f"the frame rate is {ratio**-0.5:.2f} of the assumed one (set the true rate of slow motion)"
             )
