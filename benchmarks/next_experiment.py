@@ -1,6 +1,6 @@
 """Chosen second launches against random ones: standard deviations and errors of the constants after a joint fit.
 
-    python -m benchmarks.next_experiment --seeds 1 --count 4 --random 2 --candidates 16 --out chosen.json
+    python -m benchmarks.next_experiment --seeds 1 --count 6 --random 2 --candidates 16 --out chosen.json
 
 Materials, shapes and first launches are the random scenes of development seeds. Videos are renders of the true body,
 filled with particles that have one Gaussian each. The reconstruction has other and fewer particles and Gaussians, so
