@@ -5,7 +5,7 @@ from functools import cache
 
 from neuma_lib.project.cases import LAW_FROM
 from neuma_lib.project.paths import IDENTIFIED
-from neuma_lib.config.variants import parse_replicate
+from neuma_lib.config.variants import parse_replicate, replicate_folder
 from neuma_lib.project.find import scene_files
 
 
@@ -284,3 +284,27 @@ def identify_threads(wildcards):
         return 1
     jobs = sum(job.rule.name in ("identify", "identify_views") for job in workflow.dag.needrun_jobs())
     return max(1, workflow.cores // max(1, jobs))
+
+
+@checked
+def predicted_experiment(wildcards):
+    """The experiment whose motion shall be predicted, in the replicate of the scene; None if there is none."""
+    name = SETTINGS.next.predict
+    if name is None:
+        return None
+    base, seeds = SETTINGS.replicate(subject(wildcards))
+    if name not in SETTINGS.experiments or len(SETTINGS.experiments[name].bodies) != 1:
+        problem = f"{name!r} is not an experiment with one body"
+        raise InputError("next.predict", problem, "Give the name of one in `experiments`, or null")
+    return f"experiments/{replicate_folder(name, seeds)}"
+
+
+def of_predicted(function):
+    """A function of wildcards, applied to the experiment to predict: nothing if there is none."""
+
+    @checked
+    def choose(wildcards):
+        name = predicted_experiment(wildcards)
+        return [] if name is None else function(SimpleNamespace(scene=name))
+
+    return choose

@@ -1,31 +1,5 @@
 """Which experiment to do next with an object whose material has been identified."""
 
-from neuma_lib.config.variants import replicate_folder
-
-
-@checked
-def predicted_experiment(wildcards):
-    """The experiment whose motion shall be predicted, in the replicate of the scene; None if there is none."""
-    name = SETTINGS.next.predict
-    if name is None:
-        return None
-    base, seeds = SETTINGS.replicate(subject(wildcards))
-    if name not in SETTINGS.experiments or len(SETTINGS.experiments[name].bodies) != 1:
-        problem = f"{name!r} is not an experiment with one body"
-        raise InputError("next.predict", problem, "Give the name of one in `experiments`, or null")
-    return f"experiments/{replicate_folder(name, seeds)}"
-
-
-def of_predicted(function):
-    """A function of wildcards, applied to the experiment to predict: nothing if there is none."""
-
-    @checked
-    def choose(wildcards):
-        name = predicted_experiment(wildcards)
-        return [] if name is None else function(SimpleNamespace(scene=name))
-
-    return choose
-
 
 rule next:
     input:
