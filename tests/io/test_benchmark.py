@@ -157,7 +157,7 @@ def test_the_command_writes_and_scores(data, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["dataset", "--layout", "spring_gaus", "--out", "out", "BouncyBall"]) == 0
     known = read_json("out/BouncyBall/scene.json")
-    assert (known["dt"], known["density"], known["grid"]) == (1e-3, 1000.0, 24)
+    assert (known["dt"], known["density"], known["grid"]) == (1e-3, 1000.0, 36)
     assert known["gravity"] == [0.0, -9.8, 0.0]
     assert main(["dataset", "--layout", "neuma", "--out", "more", "BouncyBal"]) == 1
     assert main(["dataset", "--layout", "neuma", "--out", "more"]) == 1  # the others are not rendered

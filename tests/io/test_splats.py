@@ -383,8 +383,8 @@ def test_a_law_moves_a_splat_in_the_step_that_it_was_learned_with():
     config = settings({"scenes": scenes, "dataset": {"frames": None, "stride": 64}})
     own = tuple(range(0, 641, 64))
     assert cases.motion_clock(config, "Guitar", "nclaw") == (5e-4, own)
-    dt, frames = cases.motion_clock(config, "Guitar", "neuma+law_from=JellyDuck")
-    assert dt == config.scenes["JellyDuck"].dt == 1e-3
+    dt, frames = cases.motion_clock(config, "Guitar", "neuma+law_from=BouncyBall")
+    assert dt == config.scenes["BouncyBall"].dt == 1e-3
     assert frames == tuple(step // 2 for step in own)
 
 
