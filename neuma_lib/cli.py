@@ -53,7 +53,7 @@ def _parser() -> argparse.ArgumentParser:
         "Renders a video of a falling duck, learns its material, and writes a film, a table and a viewer page to "
         "results/demo. Takes a few minutes on two cores. Run it in the project's folder.",
     )
-    demo.add_argument("--cores", type=int, default=2, help="CPU cores to use (default %(default)s)")
+    _add_cores(demo)
 
     new = _group(commands, "new", "create the settings of a scene or a capture")
     scene = _command(
@@ -96,8 +96,8 @@ def _parser() -> argparse.ArgumentParser:
         "Example: neuma next results/ClayCat",
     )
     following.add_argument("folder", metavar="FOLDER", help="folder of an identified scene, in results/")
-    following.add_argument("--cores", type=int, default=2, help="CPU cores to use (default %(default)s)")
-    following.add_argument("--configfile", nargs="+", default=[], metavar="FILE", help=CONFIGFILE)
+    _add_cores(following)
+    _add_configfile(following)
 
     lab = _command(
         commands,
@@ -111,8 +111,8 @@ def _parser() -> argparse.ArgumentParser:
     lab.add_argument(
         "--experiments", type=int, default=4, help="maximum number of experiments (default %(default)s)"
     )
-    lab.add_argument("--cores", type=int, default=2, help="CPU cores to use (default %(default)s)")
-    lab.add_argument("--configfile", nargs="+", default=[], metavar="FILE", help=CONFIGFILE)
+    _add_cores(lab)
+    _add_configfile(lab)
 
     law = _group(commands, "law", "export a learned material to one file, or show such a file")
     export = _command(
@@ -137,7 +137,7 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument("--weight", type=float, default=1.0, help=weight)
     steps = "allow time steps other than the one that it was learned with"
     export.add_argument("--any-step", dest="any_time_step", action="store_true", help=steps)
-    export.add_argument("--configfile", nargs="+", default=[], metavar="FILE", help=CONFIGFILE)
+    _add_configfile(export)
     adaptor = "if SOURCE is the file of a prior: adaptor, ours or a released *_lora.pt"
     export.add_argument("--adaptor", metavar="FILE", help=adaptor)
     export.add_argument("--alpha", type=float, help="scale of a released adaptor (default 16)")
@@ -188,7 +188,7 @@ def _parser() -> argparse.ArgumentParser:
     dataset.add_argument("--out", required=True, metavar="DIR", help="folder to write")
     scenes = "scenes to write (default: those of table1 and the random scenes)"
     dataset.add_argument("scenes", nargs="*", metavar="SCENE", help=scenes)
-    dataset.add_argument("--configfile", nargs="+", default=[], metavar="FILE", help=CONFIGFILE)
+    _add_configfile(dataset)
     score = _command(
         commands,
         _score,
@@ -236,7 +236,7 @@ def _parser() -> argparse.ArgumentParser:
     scene_export.add_argument("target", metavar="TARGET", help="folder to write")
     scene_export.add_argument("--engine", required=True, metavar="NAME", help="genesis, newton or mujoco")
     _add_material_options(scene_export)
-    scene_export.add_argument("--configfile", nargs="+", default=[], metavar="FILE", help=CONFIGFILE)
+    _add_configfile(scene_export)
 
     clip = _command(
         commands,
@@ -267,6 +267,14 @@ def _add_material_options(parser: argparse.ArgumentParser) -> None:
     fit = "fit the nearest law that the engine has, over the states that the law has visited"
     parser.add_argument("--fit", action="store_true", help=fit)
     parser.add_argument("--force", action="store_true", help="accept a fit with a large stress error")
+
+
+def _add_cores(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--cores", type=int, default=2, help="CPU cores to use (default %(default)s)")
+
+
+def _add_configfile(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--configfile", nargs="+", default=[], metavar="FILE", help=CONFIGFILE)
 
 
 def _command(commands: Any, run: Any, summary: str, description: str) -> argparse.ArgumentParser:

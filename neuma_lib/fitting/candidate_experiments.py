@@ -30,7 +30,7 @@ _STEPS = 32  # the steps of a video are a multiple of this, so that its frames a
 _DRAWS = 50  # per candidate
 _VIEWS = 5  # of the ring of a rendered scene, without the first
 _AZIMUTHS, _ELEVATIONS = (45, 90, 135, -90), (0, 40)  # of a second camera from the first [degrees]
-FLAWS = {
+REJECTIONS = {
     "outside": "start outside the box",
     "early": "touch the floor before the initial motion can be seen",
     "late": "touch the floor too late or never",
@@ -67,7 +67,8 @@ def placed(body: Reconstruction, rotation: np.ndarray, centre: Sequence[float]) 
 def flight(
     model: MPM, body: Reconstruction, motion: InitialMotion, duration: float
 ) -> tuple[float, str | None]:
-    """Time of the first contact of a rigid body [s], infinite if there is none in a duration [s], and its flaw.
+    """Time of the first contact of a rigid body [s], infinite if there is none in a duration [s], and the reason to
+    reject it.
 
     Returns:
         The time, and "outside" or "wall" if the body starts outside the box or touches a wall before the floor.
@@ -124,18 +125,18 @@ def draw_launches(
     contact, _ = flight(model, body, motion, steps * model.dt)
     after = steps * model.dt - (contact if math.isfinite(contact) else 0.0)
     draws = qmc.Halton(10, seed=seed).random(_DRAWS * count)
-    flaws: Counter[str] = Counter()
+    rejected: Counter[str] = Counter()
     launches: list[Launch] = []
     for draw in draws:
         launch = _launch(model, body, motion, after, lab, draw, turn)
         if isinstance(launch, str):
-            flaws[launch] += 1
+            rejected[launch] += 1
         else:
             launches.append(launch)
         if len(launches) == count:
             return launches
     if not launches:
-        counted = ", ".join(f"{number} {FLAWS[flaw]}" for flaw, number in flaws.most_common())
+        counted = ", ".join(f"{number} {REJECTIONS[reason]}" for reason, number in rejected.most_common())
         problem = f"none of {len(draws)} launches is possible inside the box: {counted}"
         raise InputError("next", problem, "Raise next.max_height or next.max_speed")
     return launches
@@ -150,7 +151,7 @@ def _launch(
     draw: np.ndarray,
     turn: bool,
 ) -> Launch | str:
-    """The launch of a point of the unit cube (10,), or its flaw."""
+    """The launch of a point of the unit cube (10,), or why it is rejected."""
     towards = _direction(draw[2], draw[3])
     towards[1] = -abs(towards[1])
     velocity = [_rounded(lab.max_speed * draw[0] * n) for n in towards]
@@ -177,9 +178,9 @@ def _launch(
         np.array(velocity), np.array(spin), (mass @ own.x0.double()).cpu().numpy(), motion.axes, motion.std
     )
     low, high = (after * share for share in _BEFORE)
-    contact, flaw = flight(model, own, start, high)
-    if flaw or not math.isfinite(contact):
-        return flaw or "late"
+    contact, reason = flight(model, own, start, high)
+    if reason or not math.isfinite(contact):
+        return reason or "late"
     if contact < low:
         return "early"
     steps = _STEPS * math.ceil((contact + after) / model.dt / _STEPS)

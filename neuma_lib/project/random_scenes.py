@@ -60,7 +60,7 @@ SHAPES = {
 }
 LETTER = Proportions(0.3, (0.25, 0.7, 0.2), (0, 0, 0), ("body",))
 """Size and sides that every letter has at least."""
-FLAWS = {
+REJECTIONS = {
     "outside": "start outside the box",
     "early": "touch the ground before the velocity can be seen",
     "late": "touch the ground too late or never",
@@ -233,16 +233,16 @@ def draw_scenes(
         shape = _dealt(settings.shapes, settings.seed, 1, k)
         laws = [law.plain() for name, law in priors.items() if name == families[family].prior]
         rng = np.random.default_rng([settings.seed, 2, k])
-        flaws: Counter[str] = Counter()
+        rejected: Counter[str] = Counter()
         for _ in range(ATTEMPTS):
             scene = _drawn(rng, settings, shape, families[family])
             dt = _largest_stable(settings, [scene["law"], *laws], grid)
-            flaw = "unstable" if dt is None else _flaw(settings, scene, gravity)
-            if flaw is None:
+            reason = "unstable" if dt is None else _rejection(settings, scene, gravity)
+            if reason is None:
                 break
-            flaws[flaw] += 1
+            rejected[reason] += 1
         else:
-            counted = ", ".join(f"{number} {FLAWS[flaw]}" for flaw, number in flaws.most_common())
+            counted = ", ".join(f"{number} {REJECTIONS[reason]}" for reason, number in rejected.most_common())
             problem = f"{ATTEMPTS} draws of a {shape} of the family {family} are unusable: {counted}"
             raise InputError("random", problem, "Change the ranges")
         scene |= {"dt": dt, "steps": STEPS * max(1, round(scene.pop("duration") / dt / STEPS))}
@@ -325,8 +325,8 @@ def _largest_stable(settings: RandomConfig, laws: Sequence[Mapping], grid: int) 
     return max((dt for dt in settings.dt if speed * dt * grid <= settings.courant), default=None)
 
 
-def _flaw(settings: RandomConfig, scene: Mapping[str, Any], gravity: Vector) -> str | None:
-    """Why a scene is unusable, one of `FLAWS`; None: it is usable.
+def _rejection(settings: RandomConfig, scene: Mapping[str, Any], gravity: Vector) -> str | None:
+    """Why a scene is unusable, one of `REJECTIONS`; None: it is usable.
 
     Before contact the body falls and rotates. It is inside its bounding box and about fills the ellipsoid in that box,
     so it touches the ground no earlier than the rotating box, and not much later than the ellipsoid.

@@ -229,8 +229,8 @@ def test_launches_keep_the_limits_of_the_lab_and_reach_the_floor_first():
         x = launch.body.x0
         box = ((x.amin(0) + x.amax(0)) / 2).tolist()
         assert box == pytest.approx([own["center"][0], own["height"], own["center"][1]])
-        contact, flaw = flight(MODEL, launch.body, launch.motion, launch.steps * MODEL.dt)
-        assert flaw is None and 0.15 * launch.steps * MODEL.dt < contact < 0.65 * launch.steps * MODEL.dt
+        contact, reason = flight(MODEL, launch.body, launch.motion, launch.steps * MODEL.dt)
+        assert reason is None and 0.15 * launch.steps * MODEL.dt < contact < 0.65 * launch.steps * MODEL.dt
     assert max(math.dist(t.settings["spin"], (0, 0, 0)) for t in launches(NextConfig(max_spin=5.0))) > 2
 
 

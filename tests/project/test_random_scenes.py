@@ -20,7 +20,7 @@ from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.paper.random_scenes import failure, random_table
 from neuma_lib.project import loading
-from neuma_lib.project.random_scenes import DENSITY, FLAWS, LETTER, SHAPES, draw_scenes, flight
+from neuma_lib.project.random_scenes import DENSITY, LETTER, REJECTIONS, SHAPES, draw_scenes, flight
 from neuma_lib.sim.model import MPM
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
@@ -229,10 +229,10 @@ REACHES = {
 }
 
 
-@pytest.mark.parametrize("flaw", FLAWS)
-def test_every_reason_to_reject_a_draw_is_reported(loaded, flaw):
-    with pytest.raises(InputError, match=f"random: 1000 draws of a .*: [0-9]+ {FLAWS[flaw]}"):
-        drawn(loaded, count=1, **REACHES[flaw])
+@pytest.mark.parametrize("reason", REJECTIONS)
+def test_every_reason_to_reject_a_draw_is_reported(loaded, reason):
+    with pytest.raises(InputError, match=f"random: 1000 draws of a .*: [0-9]+ {REJECTIONS[reason]}"):
+        drawn(loaded, count=1, **REACHES[reason])
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 from tests.support.contact_scenes import lattice
 from tests.support.errors import refused
+from tests.support.gradients import check_small_differences
 from tests.support.sim_scenes import DENSITY, DT, cube, linear_momentum, make_law
 
 pytestmark = pytest.mark.core
@@ -140,19 +141,7 @@ def test_gradients_of_each_regime(regime):
     assert (jump.abs().max() > 1e-4) == (regime in ("stick", "slip"))
     if regime == "slip":  # more where the normals at the edges are inclined
         assert sliding == pytest.approx(friction * abs(float(jump[1])), rel=0.3)
-    points = [start.x.clone().requires_grad_(), start.v.clone().requires_grad_()]
-    grads = torch.autograd.grad(value(*points), points)
-    for index, grad in enumerate(grads):
-        direction = torch.randn(grad.shape, generator=torch.Generator().manual_seed(index), dtype=grad.dtype)
-        direction *= 1e-7 / direction.norm()
-        with torch.no_grad():
-            shifted = [
-                value(*(p + sign * direction * (i == index) for i, p in enumerate(points)))
-                for sign in (1, -1)
-            ]
-        slope = float((grad * direction).sum())
-        typical = float(grad.norm() * direction.norm()) / direction.numel() ** 0.5
-        assert abs(float(shifted[0] - shifted[1]) / 2 - slope) < 1e-6 * max(abs(slope), typical)
+    check_small_differences(value, (start.x, start.v), 1e-6)
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.4, math.inf])

@@ -14,6 +14,7 @@ from neuma_lib.sim.model import MPM, MaterialRegion, contact_clearance
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 from tests.support.contact_scenes import COLLIDERS, falling_on, lattice
+from tests.support.gradients import check_small_differences
 from tests.support.sim_scenes import DT, make_law
 
 pytestmark = pytest.mark.core
@@ -183,19 +184,7 @@ def test_gradients_of_each_regime(regime, moving):
         path = rollout(model, law, replace(start, x=x, v=v), steps=3, frames=(1, 3), skip_free_flight=False)
         return loss_of(path)
 
-    points = [start.x.clone().requires_grad_(), start.v.clone().requires_grad_()]
-    grads = torch.autograd.grad(value(*points), points)
-    for index, grad in enumerate(grads):
-        direction = torch.randn(grad.shape, generator=torch.Generator().manual_seed(index), dtype=grad.dtype)
-        direction *= 1e-7 / direction.norm()
-        with torch.no_grad():
-            shifted = [
-                value(*(p + sign * direction * (i == index) for i, p in enumerate(points)))
-                for sign in (1, -1)
-            ]
-        slope = float((grad * direction).sum())
-        typical = float(grad.norm() * direction.norm()) / direction.numel() ** 0.5
-        assert abs(float(shifted[0] - shifted[1]) / 2 - slope) < 1e-6 * max(abs(slope), typical)
+    check_small_differences(value, (start.x, start.v), 1e-6)
 
 
 def states_of(model, start, law):

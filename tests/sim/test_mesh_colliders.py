@@ -17,6 +17,7 @@ from neuma_lib.sim.model import MPM, as_regions, contact_clearance
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 from tests.support.errors import refused
+from tests.support.gradients import check_small_differences
 from tests.support.sim_scenes import DT, cube, make_law, moving_cube
 
 RADIUS = 0.15
@@ -168,17 +169,7 @@ def test_finite_differences(name):
     def value(x, v):
         return loss_of(rollout(model, law, replace(start, x=x, v=v), steps=60, frames=(30, 60)))
 
-    x, v = start.x.clone().requires_grad_(), start.v.clone().requires_grad_()
-    grads = torch.autograd.grad(value(x, v), (x, v))
-    for index, grad in enumerate(grads):
-        direction = torch.randn(grad.shape, generator=torch.Generator().manual_seed(index), dtype=grad.dtype)
-        direction *= 1e-7 / direction.norm()
-        with torch.no_grad():
-            points = [[p + sign * direction * (i == index) for i, p in enumerate((x, v))] for sign in (1, -1)]
-            difference = float(value(*points[0]) - value(*points[1])) / 2
-        slope = float((grad * direction).sum())
-        typical = float(grad.norm() * direction.norm()) / direction.numel() ** 0.5
-        assert abs(difference - slope) < 1e-5 * max(abs(slope), typical)
+    check_small_differences(value, (start.x, start.v), 1e-5)
 
 
 def test_free_flight_ends_where_the_body_touches():

@@ -30,3 +30,27 @@ def check_directional_derivatives(value, tensors, generator, h=1e-6, each=True, 
         slope = sum(float((grads[name] * directions[name]).sum()) for name in names)
         assert abs(difference) > floor, names
         assert slope == pytest.approx(difference, **tolerance), names
+
+
+def check_small_differences(value, points, tolerance):
+    """Compare gradients with differences over steps of 1e-7 along a random direction of each point, so small that no
+    particle changes between stick and slip, or in and out of contact.
+
+    Args:
+        value: function of the points.
+        points: tensors in float64.
+        tolerance: relative to the slope, or to that of a typical direction if it is larger.
+    """
+    points = [point.clone().requires_grad_() for point in points]
+    grads = torch.autograd.grad(value(*points), points)
+    for index, grad in enumerate(grads):
+        direction = torch.randn(grad.shape, generator=torch.Generator().manual_seed(index), dtype=grad.dtype)
+        direction *= 1e-7 / direction.norm()
+        with torch.no_grad():
+            ends = [
+                value(*(p + sign * direction * (i == index) for i, p in enumerate(points)))
+                for sign in (1, -1)
+            ]
+        slope = float((grad * direction).sum())
+        typical = float(grad.norm() * direction.norm()) / direction.numel() ** 0.5
+        assert abs(float(ends[0] - ends[1]) / 2 - slope) < tolerance * max(abs(slope), typical)

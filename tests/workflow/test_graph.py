@@ -112,7 +112,7 @@ def test_every_table_can_be_planned(graph):
 @behind("figures", "random", f"{RESULTS}/figures/realworld.png", f"{RESULTS}/figures/reliability.png")
 def test_every_figure_can_be_planned(graph):
     modules = {module.stem for module in (ROOT / "neuma_lib/paper/figures").glob("[!_]*.py")}
-    # i23d needs a splat, stills needs photographs: test_splat_scenes.py and test_stills.py make them.
+    # i23d needs a splat, stills needs recordings: test_splat_scenes.py and test_stills.py make them.
     assert modules - {"i23d", "stills"} <= set(graph)
 
 

@@ -9,7 +9,6 @@ from PIL import Image
 from tests.support import hanging_beam as beam
 from tests.support.project import copied, overlay
 
-pytestmark = pytest.mark.slow
 RESULTS = "tiny/results"
 
 
