@@ -31,21 +31,26 @@ def thread_count() -> int:
 
 
 def in_threads(
-    work: Callable[[Item], Result], items: Sequence[Item], kernels: Hashable, count: int | None = None
+    work: Callable[[Item], Result],
+    items: Sequence[Item],
+    kernels: Sequence[Hashable],
+    count: int | None = None,
 ) -> list[Result]:
     """Results of ``work`` for each of the items.
 
     Args:
         work: a function that releases Python's lock for most of its time. Torch's gradient mode is not inherited.
-        kernels: key of the kernels that it loads. One thread has to load them, hence the first item of a key is
-            processed alone.
+        kernels: for each item, a key of the kernels that it loads. Warp may unload a kernel that another thread runs
+            while it loads one, hence the first item of each key is processed alone.
         count: number of threads, by default `thread_count`.
     """
     count = min(count or _count, len(items))
-    alone = len(items) if count < 2 else int(kernels not in _loaded)
-    results = [work(item) for item in items[:alone]]
-    _loaded.update([kernels] if results else [])
-    if alone < len(items):
+    first = {key: index for index, key in reversed(list(enumerate(kernels)))}
+    alone = range(len(items)) if count < 2 else sorted(i for key, i in first.items() if key not in _loaded)
+    results = {index: work(items[index]) for index in alone}
+    _loaded.update(kernels)
+    others = [index for index in range(len(items)) if index not in results]
+    if others:
         with ThreadPoolExecutor(count) as executor:
-            results += executor.map(work, items[alone:])
-    return results
+            results |= zip(others, executor.map(work, [items[index] for index in others]), strict=True)
+    return [results[index] for index in range(len(items))]

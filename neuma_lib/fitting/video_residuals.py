@@ -273,7 +273,8 @@ class VideoResiduals:
             return self._residual(*each, on, count)
 
         threads = None if on.body.x0.device.type == "cpu" else 1
-        return in_threads(residual, list(zip(candidates, paths, flown, strict=True)), on.kernels, threads)
+        items = list(zip(candidates, paths, flown, strict=True))
+        return in_threads(residual, items, [on.kernels] * len(items), threads)
 
     @torch.no_grad()
     def _residual(

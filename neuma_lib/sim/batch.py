@@ -87,7 +87,8 @@ def rollout_batch(
         return _side_by_side(model, *own, frames, total, skip_free_flight, frictions)
 
     threads = 1 if device.type == "cuda" or not all(map(has_kernels, laws)) else None
-    paths = in_threads(simulated, groups, (rollout_batch, model.frictionless, dtype, total), threads)
+    kernels = [(rollout_batch, model.frictionless, dtype, total, _kinds(laws, copies)) for copies in groups]
+    paths = in_threads(simulated, groups, kernels, threads)
     result: list[Trajectory | None] = [None] * len(laws)
     for copy, path in zip(order + viscous, chain.from_iterable(paths), strict=True):
         result[copy] = path
@@ -95,6 +96,14 @@ def rollout_batch(
 
 
 @torch.no_grad()
+def _kinds(laws: Sequence[Law], copies: Sequence[int]) -> tuple[tuple[type, ...], ...]:
+    """Classes of the parts of some laws, which determine their kernels."""
+    return tuple(
+        tuple(type(part) for part in (law.elasticity, law.plasticity, law.viscosity))
+        for law in (laws[copy] for copy in copies)
+    )
+
+
 def _side_by_side(
     model: MPM,
     laws: Sequence[Law],
