@@ -14,21 +14,21 @@ pytestmark = pytest.mark.core
 def test_the_first_item_of_each_key_is_processed_alone(count):
     """Also of a key that appears later, and once: items of known keys share the threads."""
     first, second = object(), object()
-    running, beside, lock = set(), {}, threading.Lock()
+    running, company, lock = set(), {}, threading.Lock()
 
     def work(item):
         with lock:
             running.add(item)
         time.sleep(0.05)
         with lock:
-            beside[item] = set(running) - {item}
+            company[item] = set(running) - {item}
             running.remove(item)
         return 10 * item
 
     kernels = [first, first, second, first, second]
     assert in_threads(work, range(5), kernels, count) == [0, 10, 20, 30, 40]
-    assert not beside[0] and not beside[2]
-    assert any(beside.values()) == (count > 1)
+    assert not company[0] and not company[2]
+    assert any(company.values()) == (count > 1)
     assert in_threads(work, range(2), [first, second], count) == [0, 10]
-    assert any(beside[item] for item in (0, 1)) == (count > 1)
+    assert any(company[item] for item in (0, 1)) == (count > 1)
     assert in_threads(work, [], [], count) == []
