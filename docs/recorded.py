@@ -72,7 +72,7 @@ SUMMARY = (
         "Average",
     ),
 )
-"""Rows of the summary: text, page, tables, of which the first that has a method is used, and column."""
+"""Rows of the summary: text, page, tables (the first of the same record that has a method is used), and column."""
 END = "<!-- / -->"
 NUMBER = re.compile(rf"(<!-- ([\w/]+ [^\s>]+ [^\s>]+(?: \w+)?) -->).*?({END})", re.DOTALL)
 WHOLE_TABLE = re.compile(r"(<!-- table ([\w/]+) (\w+) -->\n).*?(<!-- /table -->)", re.DOTALL)
@@ -168,7 +168,8 @@ def summary(tables: Tables) -> str:
     for text, page, names, column in SUMMARY:
         cells = []
         for method in METHODS:
-            has = (name for name in names if (RMSE, method) in tables.rows(name))
+            same = (name for name in names if tables.origin(name) == tables.origin(names[0]))
+            has = (name for name in same if (RMSE, method) in tables.rows(name))
             cells.append(tables.cell(name, method, column) if (name := next(has, None)) else "")
         if any(cells):
             seed = re.search(r", seed \d+", tables.markdown.get(names[0], "")) if column == "Median" else None
@@ -183,7 +184,8 @@ def summary(tables: Tables) -> str:
 
 def overview(tables: Tables) -> str:
     """RMSE of Table 1 for the README, with its average on converged truths. Averages have their spread."""
-    rows = {**error_rows(tables, "yardstick"), **error_rows(tables, "table1")}
+    same = tables.origin("yardstick") == tables.origin("table1")
+    rows = {**(error_rows(tables, "yardstick") if same else {}), **error_rows(tables, "table1")}
     converged = error_rows(tables, "table1_converged")
     head = rows.pop("Method")
     last, last_converged = (row.index("Average") for row in (head, converged.pop("Method", head)))
@@ -199,7 +201,7 @@ def overview(tables: Tables) -> str:
         if title in rows
     ]
     sources = [
-        f"{', '.join(tables.markdown[name].split(', ')[:2])}: [{text}](docs/results/{name}.md)"
+        f"[{text}](docs/results/{name}.md): commit {tables.origin(name)}"
         for name, text in (("table1", "six scenes"), ("table1_converged", "converged truths"))
         if name in tables.markdown
     ]
