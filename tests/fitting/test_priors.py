@@ -1,12 +1,14 @@
 """Priors: what the networks are fitted to, that fitting works and is repeatable."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
 from safetensors.torch import save
 
 from neuma_lib.config.priors import RegressionConfig
+from neuma_lib.fitting import prior_training
 from neuma_lib.fitting.prior_launches import random_launch, random_rotations, reference_law, visited_stretches
 from neuma_lib.fitting.prior_regression import (
     Network,
@@ -228,3 +230,24 @@ def test_a_rough_prior_is_rough_by_its_return_map_alone(name):
     assert parts["elasticity"] < ROUGH[name] < CLOSE < parts["plasticity"]
     assert CLOSE <= report["chamfer"] < 0.5
     assert f"Chamfer {report['chamfer']:.4f}e-4 m^2. WARNING" in remark(report)
+
+
+def test_the_deviation_of_a_prior_is_that_of_all_frames(monkeypatch):
+    """Of a stub whose particle is k mm off in frame k of 4 of the first launch, and exact in the second."""
+    asked = []
+
+    class Stub:
+        steps = 100
+
+        def run(self, law, frames):
+            asked.append(frames)
+            x = torch.zeros(len(frames), 1, 3)
+            if len(asked) == 1:
+                x[:, 0, 1] = 1e-3 * torch.arange(1, len(frames) + 1)
+            return SimpleNamespace(x=x)
+
+    monkeypatch.setattr(prior_training, "random_launch", lambda *given: Stub())
+    report = evaluate_prior(reference_law(JELLY, TINY), JELLY, TINY, launches=2, frames=4)
+    assert asked == [[25, 50, 75, 100]] * 4
+    assert report["rmse"] == pytest.approx(1.25e-3) and report["rmse_worst"] == pytest.approx(4e-3)
+    assert report["chamfer"] == pytest.approx(2 * (1 + 4 + 9 + 16) / 4 * 1e-6 * 1e4 / 2)
