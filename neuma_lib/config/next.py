@@ -32,4 +32,6 @@ class NextConfig(Section):
         "possible; null: candidates are ranked by the constants of the material",
     )
     candidates: int = internal(40, "number of candidates", ge=1, le=500)
-    rivals: int = internal(1, "other families to distinguish, those with the lowest scores", ge=0)
+    rivals: int = internal(
+        1, "other families to distinguish, those with the lowest scores, and all that predict as well", ge=0
+    )

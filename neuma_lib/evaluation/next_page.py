@@ -32,8 +32,9 @@ PAGE = """\
 {table}
 
 `after` is the {goal}, now {before}. Columns of constants are the expected standard deviations of their logarithms after
-the experiment. The last column is the expected logarithm of the Bayes factor. All are predictions to first order from
-simulated and rendered candidates.
+the experiment. `determines` names the constants, or the combination of them, that become determined. The last columns
+are the expected logarithms of the Bayes factor of {family} against other families. All are predictions to first order
+from simulated and rendered candidates.
 
     neuma new scene NAME --from {place}
 """
@@ -117,13 +118,21 @@ def page(choice: Mapping[str, Any], picture: str, place: str) -> str:
         for rank, each in enumerate(candidates[:SHOWN], 1)
     ]
     rivals = list(candidates[0]["log_bayes_factors"])
-    header = ["rank", "experiment", "after", *choice["known"], *(f"against {name}" for name in rivals)]
+    header = [
+        "rank",
+        "experiment",
+        "after",
+        *choice["known"],
+        "determines",
+        *(f"against {name}" for name in rivals),
+    ]
     rows = [
         [
             rank,
             describe(each),
             _goal(choice["goal"], each["after"]),
             *(_percent(std) for std in each["expected"].values()),
+            ", ".join(each["becomes_determined"]),
             *(
                 "excluded" if (v := each["log_bayes_factors"][name]) is None else f"{v:.1f}"
                 for name in rivals
@@ -138,6 +147,7 @@ def page(choice: Mapping[str, Any], picture: str, place: str) -> str:
         goal=_GOALS[choice["goal"]],
         before=_goal(choice["goal"], choice["before"]),
         place=place,
+        family=choice["family"],
     )
 
 

@@ -29,7 +29,7 @@ from neuma_lib.splatting.viewpoints import Views, framing, ring_directions, vide
 _MARGIN = 0.02  # minimum distance of the body from the walls at the start, as of random scenes [m]
 _MOMENTS = 100  # times of a flight at which contact is tested
 _BEFORE = (0.25, 1.5)  # duration of the flight over that after contact: the initial motion must be visible
-_DURATION = 2.5  # of the longest video, in times that the existing one shows after the contact
+_DURATION = 2.5  # of the longest press, in times that the existing video shows after the contact
 _PRESSED, _PLATEN = (
     (0.1, 0.45),
     0.02,
@@ -46,6 +46,7 @@ REJECTIONS = {
     "early": "touch the floor before the initial motion can be seen",
     "late": "touch the floor too late or never",
     "wall": "touch another wall before the floor",
+    "fast": "need a faster platen",
     "empty": "have too little of the body in the clamp",
 }
 """Why a draw is rejected."""
@@ -211,7 +212,9 @@ def _press(
     top, low = height + size[1] / 2 + _MARGIN + _PLATEN, size[1] * (1 - _between(_PRESSED, draw[0])) + _PLATEN
     if height > lab.max_height or top + _PLATEN > 1:
         return "outside"
-    down = max(after * _between((0.25, 1.0), draw[1]), (top - low) / max(lab.max_speed, 1e-9))
+    down = after * _between((0.25, 0.5 * _DURATION), draw[1])
+    if top - low > lab.max_speed * down:
+        return "fast"
     times = [_rounded(wait + k * down) for k in range(3)]
     poses = [
         [time, [0.5, _rounded(y), 0.5], [0.0, 0.0, 0.0]]
@@ -221,7 +224,7 @@ def _press(
     platen = {"shape": "box", "size": [widths[0], _PLATEN, widths[1]], "keyframes": poses}
     settings = {"height": height, "center": [0.5, 0.5], **_REST, "colliders": [platen]}
     model = replace(model, contact="particles", colliders=(*model.colliders, Collider(**platen)))
-    return _landing(settings, model, body, motion, after, wait + after, min(2 * down, _DURATION * after))
+    return _landing(settings, model, body, motion, after, wait + after, 2 * down)
 
 
 def _landing(

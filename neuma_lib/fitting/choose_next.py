@@ -236,7 +236,7 @@ def choose_next(
 
     now = Forecast(fit, np.zeros_like(fit.covariance), {})
     before, prediction = ranked(now)
-    candidates = _candidates(filmed[0], known, lab, reframe, seed)
+    candidates = _candidates(filmed[0], known, lab, reframe, seed, log)
     options, failed = [], 0
     for done, (kind, own, experiment, path) in enumerate(candidates):
         try:
@@ -258,9 +258,17 @@ def choose_next(
 
 
 def _candidates(
-    first: Experiment, known: Knowledge, lab: NextConfig, reframe: bool, seed: int
+    first: Experiment,
+    known: Knowledge,
+    lab: NextConfig,
+    reframe: bool,
+    seed: int,
+    log: Callable[[str], None],
 ) -> list[tuple[str, dict[str, Any], Experiment | None, Trajectory | None]]:
-    """Kind, settings, experiment and motion of each candidate; no experiment where the motion diverges."""
+    """Kind, settings, experiment and motion of each candidate; no experiment where the motion diverges.
+
+    Kinds that are not possible are left out, unless there is no other.
+    """
     frames = joint_frames(first.video)
     cameras = first.video[0].cameras
     candidates: list[tuple[str, dict[str, Any], Experiment | None, Trajectory | None]] = []
@@ -270,14 +278,21 @@ def _candidates(
         for place, camera in second_cameras(cameras[0], points, reframe)[: lab.candidates]:
             video = [*first.video, unfilmed(frames, camera)]
             candidates.append(("camera", dict(place), path and replace(first, video=video), path))
-    kinds = [kind for kind in lab.kinds if kind != "camera"]
+    kinds, refusals = [kind for kind in lab.kinds if kind != "camera"], list[InputError]()
     left = lab.candidates - len(candidates)
     for k, kind in enumerate(kinds):
         count = (k + 1) * left // len(kinds) - k * left // len(kinds)
         if count < 1:
             continue
         own_seed = seed + list(STARTS).index(kind)
-        starts = draw_starts(first.model, first.body, first.motion, frames[-1], lab, count, own_seed, kind)
+        try:
+            starts = draw_starts(
+                first.model, first.body, first.motion, frames[-1], lab, count, own_seed, kind
+            )
+        except InputError as error:
+            refusals.append(error)
+            log(str(error))
+            continue
         spaced = [
             tuple(round(k * start.steps / (len(frames) - 1)) for k in range(len(frames))) for start in starts
         ]
@@ -291,6 +306,8 @@ def _candidates(
                 seen = as_cameras(views, cameras)
             experiment = Experiment(start.model, start.motion, start.body, [unfilmed(own, seen)])
             candidates.append((kind, start.settings, experiment if path else None, path))
+    if not candidates:
+        raise refusals[0]
     return candidates
 
 

@@ -285,6 +285,17 @@ def test_no_start_inside_the_box_is_refused(kind):
         starts(NextConfig(max_height=0.1), kind=kind)
 
 
+def test_kinds_that_are_not_possible_are_left_out_unless_there_is_no_other(alone):
+    """A lab in which nothing moves can film the body from elsewhere, but not press it."""
+    lab, lines = NextConfig(candidates=7, max_speed=0, kinds=("press", "camera")), []
+    fit = replace(alone.best, covariance=400 * alone.best.covariance)
+    choice = choose_next(fit, [experiment()], settings(), lab, log=lines.append)
+    assert {option.kind for option in choice.options} == {"camera"} and "press" in "".join(lines)
+    with refused("next", problem="press"):
+        lab = lab.model_copy(update={"kinds": ("press",)})
+        choose_next(fit, [experiment()], settings(), lab)
+
+
 def test_a_platen_presses_the_body_on_the_floor_and_lets_go():
     """The body lands before the platen touches it, is compressed to where the platen stops, and is free at the end."""
     for start in starts(NextConfig(max_speed=1.5), 4, "press"):

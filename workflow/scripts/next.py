@@ -49,7 +49,7 @@ def main(inputs, output, params, run) -> None:
         experiments,
         settings,
         lab,
-        rivals=read_rivals(record, settings, fit, lab.rivals),
+        rivals=read_rivals(record, settings, fit, max(lab.rivals, len(record["ties"]))),
         ties=bool(record["ties"]),
         derivatives=derivatives,
         reframe=params.rendered,
