@@ -401,8 +401,8 @@ class TestTruth:
         assert loaded.identify_of("BouncyBall+seed=1").refined_particles == 0
         assert loaded.identify_of("BouncyBall_converged+seed=1") == loaded.identify
         assert loaded.identify.refined_particles > 0
-        finer = changed(dataset={"grid": 40}, random={"count": 0})
-        assert finer.identify_of("BouncyBall") == finer.identify
+        refined = changed(dataset={"grid": 40}, random={"count": 0})
+        assert refined.identify_of("BouncyBall") == refined.identify
 
     def test_the_converged_table_has_96_cells_and_is_optional(self, loaded, changed):
         table = loaded.tables["table1_converged"]
