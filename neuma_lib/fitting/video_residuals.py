@@ -201,12 +201,13 @@ class VideoResiduals:
         return [len(body.x0) for body in self._coarse.bodies]
 
     def hold_out(self, family: Family | Bodies, share: float) -> None:
-        """Hold out the last share of the frames after the first contact, whose time is the same for any law."""
+        """Hold out the last share of the frames after the first contact, whose time is the same for any law, or of all
+        frames of a clamped body."""
         values = family.values(family.unbounded(family.guess), self.model, self.density)
         one = Candidate(family.law_spec(values), np.zeros(self.deviations))
         (path,), _ = self._paths([one], len(self.frames), self._coarse)
         contact = 0
-        if path is not None:
+        if path is not None and not self.model.clamps:
             x = path.at(self.frames).x.split(self.particles, dim=1)
             bodies = zip(x, self._coarse.bodies, strict=True)
             contact = min(first_contact(self.model, own, body.vol0, self.frames) for own, body in bodies)
