@@ -92,3 +92,22 @@ use rule identified_table as identified_behind_table with:
         markdown=f"{RESULTS}/identified_{{table}}.md",
     params:
         scenes=lambda wildcards: identified_behind(wildcards.table),
+
+
+rule bodies_table:
+    input:
+        identified=of_replicate("identified.json"),
+        metrics=f"{RESULTS}/{{scene}}/constants/metrics.json",
+        true_law=f"{RESULTS}/{{scene}}/true_law/metrics.json",
+        alone=of_each_body(of_replicate("identified.json")),
+        alone_metrics=of_each_body(lambda wildcards: f"{RESULTS}/{wildcards.scene}/constants/metrics.json"),
+    output:
+        csv=f"{RESULTS}/{{scene}}/bodies.csv",
+        markdown=f"{RESULTS}/{{scene}}/bodies.md",
+    wildcard_constraints:
+        scene=PILE_SCENE,
+    params:
+        laws=of_section(lambda scene: {name: body.law.plain() for name, body in scene.bodies.items()}),
+        frictions=of_section(lambda scene: [pair.plain() for pair in scene.pairs]),
+    script:
+        "../scripts/bodies_table.py"
