@@ -35,8 +35,8 @@ def bodies_table(
         errors: RMSE of each body [mm] with the true laws, identified together, and alone.
     """
     rows: list[list[Any]] = []
-    for name, of_law, together, apart in ((name, *values) for name, values in errors.items()):
-        rows.append([name, "RMSE [mm]", of_law, together, None, apart, None])
+    for name, of_law, together, other in ((name, *values) for name, values in errors.items()):
+        rows.append([name, "RMSE [mm]", of_law, together, None, other, None])
         records = identified["bodies"][name], alone[name]
         spec = truth[name]
         true_family = "+".join(
@@ -49,8 +49,8 @@ def bodies_table(
             key: value for part in spec.values() if part for key, value in part.items() if key != "name"
         }
         for key, value in named_combinations(constants).items():
-            found = [record["best"]["quantities"].get(key, {}) for record in records]
-            numbers = [number for each in found for number in (each.get("value"), each.get("log_std"))]
+            fitted = [record["best"]["quantities"].get(key, {}) for record in records]
+            numbers = [number for each in fitted for number in (each.get("value"), each.get("log_std"))]
             rows.append([name, key, value, *numbers])
     true = {frozenset(pair["bodies"]): pair["friction"] for pair in frictions}
     for pair in identified["pairs"]:

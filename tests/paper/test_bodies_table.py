@@ -28,12 +28,12 @@ def test_rows_of_bodies_and_pairs():
     text, page = bodies_table(identified, alone, truth, frictions, errors)
     header, *rows = csv.reader(io.StringIO(text))
     assert tuple(header) == COLUMNS
-    found = {(row[0], row[1]): row[2:] for row in rows}
-    assert found["cat", "RMSE [mm]"] == ["2.0", "3.0", "", "9.0", ""]
-    assert found["cat", "family"] == ["hencky+von_mises", "plastic", "", "elastic", ""]
-    assert found["cat", "yield_stress"] == ["1000.0", "950.0", "0.1", "", ""]
-    assert found["ball", "E"] == ["100000.0", "110000.0", "0.1", "150000.0", "0.1"]
-    assert found["cat and ball", "friction"] == ["0.5", "0.4", "0.2", "", ""]
+    cells = {(row[0], row[1]): row[2:] for row in rows}
+    assert cells["cat", "RMSE [mm]"] == ["2.0", "3.0", "", "9.0", ""]
+    assert cells["cat", "family"] == ["hencky+von_mises", "plastic", "", "elastic", ""]
+    assert cells["cat", "yield_stress"] == ["1000.0", "950.0", "0.1", "", ""]
+    assert cells["ball", "E"] == ["100000.0", "110000.0", "0.1", "150000.0", "0.1"]
+    assert cells["cat and ball", "friction"] == ["0.5", "0.4", "0.2", "", ""]
     assert "| cat | RMSE [mm] | 2 | 3 |  | 9 |  |" in page
     sticking, _ = bodies_table(identified, alone, truth, [], errors)
     assert "cat and ball,friction,inf,0.4,0.2,," in sticking

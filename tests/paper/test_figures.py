@@ -177,7 +177,7 @@ DATA = {
         4,
         5,
         {},
-        row_titles=["filmed", "understood", "one taken out", "one taken out, true laws"],
+        row_titles=["filmed", "understood", "one taken out", "true laws"],
         column_titles=[f"{100 * i} ms" for i in range(5)],
     ),
     "stills": lambda: pictures(

@@ -448,7 +448,7 @@ if DRAWN.pile:
         },
         "params": {
             "body_of": [0, 1, 1],
-            "titles": ["filmed", "understood", "one taken out", "one taken out, true laws"],
+            "titles": ["filmed", "understood", "one taken out", "true laws"],
             "frames": [
                 list(SETTINGS.frame_steps(PILE)),
                 list(SETTINGS.dataset.frame_steps(SETTINGS.experiment(DRAWN.pile).steps)),

@@ -8,10 +8,10 @@ from workflow.stage import run_script
 def main(inputs, output, params, run) -> None:
     names = list(params.laws)
     files = {name: listed(inputs[name]) for name in ("alone", "alone_metrics")}
-    alone, apart = (dict(zip(names, map(read_json, own), strict=True)) for own in files.values())
+    alone, other = (dict(zip(names, map(read_json, own), strict=True)) for own in files.values())
     together = [read_json(file)["bodies"] for file in (inputs.true_law, inputs.metrics)]
     errors = {
-        name: [*(bodies[k]["tracer_rmse_mm"] for bodies in together), apart[name]["tracer_rmse_mm"]]
+        name: [*(bodies[k]["tracer_rmse_mm"] for bodies in together), other[name]["tracer_rmse_mm"]]
         for k, name in enumerate(names)
     }
     identified = read_json(inputs.identified)

@@ -12,7 +12,7 @@ from neuma_lib.io.images import load_observation
 from neuma_lib.io.particles import load_motion
 from neuma_lib.paper.image_grid import ImageGrid, rows_figure
 
-LEFT, TOP = 1.2, 0.2
+LEFT, TOP = 0.9, 0.2
 
 
 def data(inputs, params, log) -> ImageGrid:
