@@ -356,6 +356,7 @@ def test_a_body_is_blurred_over_the_exposure(room):
     assert abs(blurred_place - place) < 0.5
     assert np.sqrt(12 * (blurred_spread - spread)) == pytest.approx(np.ptp(ends[:, 1]), rel=0.15)
 
+
 @pytest.mark.skipif(importlib.util.find_spec("bpy") is None, reason="needs Blender (bpy)")
 def test_a_rolling_shutter_shears_what_moves_across_the_picture(room):
     """Lower rows are read later, so that a post which moves to the right leans by its way in a row time."""
