@@ -41,10 +41,10 @@ class SwingConfig(Section):
 
     body: str = Field(description="body of `stills.bodies` whose mu / rho predicts the motion")
     still: str = Field(description="name in frames.json of the record of the held body")
-    silhouettes: str = Field(description="folder of the label maps, with times.json, relative to `stills.root`")
-    held: RegionConfig = Field(
-        description="region of the undeformed body that a force against gravity holds"
+    silhouettes: str = Field(
+        description="folder of the label maps, with times.json, relative to `stills.root`"
     )
+    held: RegionConfig = Field(description="region of the undeformed body that a force against gravity holds")
 
 
 class StillsConfig(Section):

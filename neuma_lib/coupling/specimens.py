@@ -166,7 +166,9 @@ def clamped_body(
     root, reach = _HELD + _MARGIN, float(np.linalg.norm(local, axis=1).max())
     along, above = float(local[:, 0].max()), float(local[:, 1].max())
     grid = 2 * _MARGIN + max(_HELD + math.ceil(along / dx), math.ceil((above + reach) / dx)) + 1
-    lower = grid - _MARGIN - math.ceil((above - local[first][:, 1].min()) / dx)  # node at the section's lower face
+    lower = (
+        grid - _MARGIN - math.ceil((above - local[first][:, 1].min()) / dx)
+    )  # node at the section's lower face
     edge = grid * dx
     centre = np.array([root * dx, lower * dx + (section[1] - section[0])[1] / 2, edge / 2])
     mass = density * volumes
@@ -200,8 +202,12 @@ def clamped_body(
 
 
 def released(specimen: Specimen, law: Law, duration: float, frame: float) -> tuple[Array, Tensor]:
-    """Times after the release (T,) [s], at about an interval [s], and positions (T, N, 3) [m] of particles in the axes of
-    the body, some longer than the duration."""
+    """Times after the release (T,) [s] and positions (T, N, 3) [m] of particles in the axes of the body.
+
+    Args:
+        duration: [s], which the last times exceed.
+        frame: interval [s], about.
+    """
     dt = specimen.model.dt
     stride = max(1, int(frame / dt))
     steps = stride * (int(duration / dt / stride) + 2)

@@ -36,10 +36,12 @@ GRAVITY = 9.81
 ROTATION, TRANSLATION, PLACEMENT = slice(0, 3), slice(3, 6), slice(6, 9)
 RATIO, HELD, RELEASE = 9, 10, 11
 CENTRE = slice(12, 14)
-"""Unknowns: changes of the camera's pose and of the placement, of log(mu / rho), of the share of the weight that is held
-and of the time of release, and of the principal point of a second camera."""
+"""Unknowns: changes of the camera's pose and of the placement, of log(mu / rho), of the share of the weight that is
+held, of the time of release, and of the principal point of a second camera."""
 UNKNOWNS = 14
-_SCALES = np.array([0.1] * 3 + [0.01] * 3 + [1.0] * 3 + [0.1, 0.03, 5e-3, 5.0, 5.0])  # rad, m, (prior), 1, 1, s, px
+_SCALES = np.array(
+    [0.1] * 3 + [0.01] * 3 + [1.0] * 3 + [0.1, 0.03, 5e-3, 5.0, 5.0]
+)  # rad, m, (prior), 1, 1, s, px
 _SHAPE = slice(9, 12)
 _CONTOUR_NOISE, _CORRELATED = (
     2.0,
@@ -97,18 +99,31 @@ def _sampled(mask: NDArray[np.bool_], points: Array) -> NDArray[np.bool_]:
 
 
 class ClampedBody(Protocol):
-    """A body whose surface depends on its shape, three numbers: mu / rho [m^2/s^2], the share of its weight that is held
-    before a release, and the time of the release [s]."""
+    """A body whose surface depends on three numbers: mu / rho [m^2/s^2], the share of its weight that is held before a
+    release, and the time of the release [s]."""
 
-    triangles: NDArray[np.int64]
-    rotation: Array
-    hidden_points: NDArray[np.bool_]
+    @property
+    def triangles(self) -> NDArray[np.int64]:
+        """Points of the triangles of the surface (T, 3)."""
+        ...
+
+    @property
+    def rotation(self) -> Array:
+        """From the body's frame to the marker's, shape (3, 3)."""
+        ...
+
+    @property
+    def hidden_points(self) -> NDArray[np.bool_]:
+        """Points of the surface that other objects hide (P,)."""
+        ...
 
     def positions(self, shape: Array) -> Array:
         """Points of the surface (P, 3) [m] in the body's frame."""
+        ...
 
     def derivatives(self, shape: Array, free: Sequence[int]) -> Array:
         """Their derivatives by log(mu / rho), share and time (3, P, 3). Those by others than ``free`` may be 0."""
+        ...
 
 
 @dataclass(eq=False)
@@ -422,7 +437,9 @@ def fit_still(
         NonFiniteError: no pose leads to a finite fit.
     """
     free = [*range(9)] if fixed_ratio else [*range(9), RATIO]
-    problems = [Stills([StillResiduals(still, body, pose, placement, placement_std, ratio)]) for pose in poses]
+    problems = [
+        Stills([StillResiduals(still, body, pose, placement, placement_std, ratio)]) for pose in poses
+    ]
     fits = [
         (problem, *problem.minimise(np.zeros(UNKNOWNS), free, iterations))
         for problem in problems
@@ -445,7 +462,9 @@ class Stills:
 
     def linearise(self, unknowns: Array, free: Sequence[int], exact: bool = True) -> Linearisation:
         parts = [part.linearise(unknowns, free) for part in self.parts]
-        curvatures, scores = (np.stack([getattr(part, key) for part in parts]) for key in ("curvature", "slope"))
+        curvatures, scores = (
+            np.stack([getattr(part, key) for part in parts]) for key in ("curvature", "slope")
+        )
         rms = float(np.sqrt(np.mean([part.rms**2 for part in parts])))
         return Linearisation(curvatures, scores, sum(part.cost for part in parts), rms)
 

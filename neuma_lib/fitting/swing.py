@@ -16,10 +16,9 @@ from typing import Any
 
 import numpy as np
 import torch
+import trimesh
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
-
-import trimesh
 
 from neuma_lib.config.stills import RestingBodyConfig, SwingConfig
 from neuma_lib.coupling.interpolation import Interpolation
@@ -259,19 +258,24 @@ def swing_record(
     duration = max(frames) - min(0.0, *FIRST_RELEASES) + 0.02
     prior = np.array(settings.placement), settings.placement_std
     for name, ratio in ratios.items():
-        body, grids, last = resting_body(mesh, settings, settings.clamps[name], size, swing.held), [], None
+        body, grids = resting_body(mesh, settings, settings.clamps[name], size, swing.held), []
+        outlines: list[list] = []
         for dx in cells:
             motion = Swing(body, resting_law(settings.nu), dx, duration)
             own: dict[str, Any] = {"cell": dx}
             for key in ("predicted", "fitted"):
+                given = key == "predicted"
                 fit = fit_swing(
-                    held, list(frames.values()), list(frames), motion, poses, *prior, ratio, key == "predicted"
+                    held, list(frames.values()), list(frames), motion, poses, *prior, ratio, given
                 )
-                own[key], last = fit.as_dict(), fit if key == "predicted" else last
+                own[key] = fit.as_dict()
+                if given:
+                    outlines = [
+                        [line.round(1).tolist() for line in contours(frame.predicted)] for frame in fit.frames
+                    ]
                 done += 1
                 if progress:
                     progress(done, total)
             grids.append(own)
-        outlines = [[line.round(1).tolist() for line in contours(frame.predicted)] for frame in last.frames]
         clamps[name] = {"hang": ratio, "grids": grids, "outlines": outlines}
     return {"times": list(frames), "clamps": clamps}

@@ -56,7 +56,9 @@ def test_the_twin_of_the_swing_has_its_stiffness():
     fit = fit_swing(*options, 80.0, fixed_ratio=False)
     first = fit.frames[0]
     assert first.ratio == pytest.approx(RATIO_OF_TWIN, rel=0.05)
-    assert first.shape[1] == pytest.approx(SHARE, abs=0.05) and first.shape[2] == pytest.approx(RELEASED, abs=4e-3)
+    assert first.shape[1] == pytest.approx(SHARE, abs=0.05) and first.shape[2] == pytest.approx(
+        RELEASED, abs=4e-3
+    )
     assert fit.contour_rms < 1.0 and fit.held.contour_rms < 1.0
     given = fit_swing(*options, RATIO_OF_TWIN, fixed_ratio=True)
     assert given.contour_rms < 1.0 and given.frames[0].ratio == pytest.approx(RATIO_OF_TWIN)
@@ -86,7 +88,9 @@ def test_files_of_a_swing(tmp_path):
 def test_a_record_of_a_swing_has_both_results():
     """With one frame on a coarse grid, for its keys. The outline is that of the prediction."""
     held, frames = twin(0.015)
-    settings = RestingBodyConfig(**BODY | {"clamps": {"7 cm": BODY["clamps"]["7 cm"]}, "unit": 1.0, "nu": 0.45})
+    settings = RestingBodyConfig(
+        **BODY | {"clamps": {"7 cm": BODY["clamps"]["7 cm"]}, "unit": 1.0, "nu": 0.45}
+    )
     region = {"lowest": beam.HELD[0].tolist(), "highest": beam.HELD[1].tolist()}
     own = SwingConfig(body="beam", still="twin", silhouettes="swing", held=region)
     frames = {TIMES[1]: frames[TIMES[1]]}

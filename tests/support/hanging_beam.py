@@ -79,8 +79,7 @@ def image_of(beam, *shape, still=None, centre=None):
 
 
 def depth_camera(mask):
-    """A still of a second camera next to the first, without a marker, with a strip of unknown pixels across the beam and
-    all of the box at its root."""
+    """A still of a second camera without a marker. A strip across the beam and the box at its root are unknown."""
     K2, camera = K.copy(), np.eye(4)
     K2[0, 0] = K2[1, 1] = 740.0
     camera[:3, :3] = Rotation.from_euler("xy", [1.5, -1.0], degrees=True).as_matrix()
