@@ -252,14 +252,14 @@ def swing_record(
 
     Returns:
         Plain values: ``clamps``, name -> ``hang``, mu / rho, and ``grids``, a list of ``cell``, ``predicted`` and
-        ``fitted``, see `SwingFit.as_dict`, and ``outlines``, those of the prediction on the last grid [px].
+        ``fitted``, see `SwingFit.as_dict`, and ``silhouettes``, those of the prediction on the last grid [px].
     """
     clamps, done, total = {}, 0, 2 * len(ratios) * len(cells)
     duration = max(frames) - min(0.0, *FIRST_RELEASES) + 0.02
     prior = np.array(settings.placement), settings.placement_std
     for name, ratio in ratios.items():
         body, grids = resting_body(mesh, settings, settings.clamps[name], size, swing.held), []
-        outlines: list[list] = []
+        silhouettes: list[list] = []
         for dx in cells:
             motion = Swing(body, resting_law(settings.nu), dx, duration)
             own: dict[str, Any] = {"cell": dx}
@@ -270,12 +270,12 @@ def swing_record(
                 )
                 own[key] = fit.as_dict()
                 if given:
-                    outlines = [
+                    silhouettes = [
                         [line.round(1).tolist() for line in contours(frame.predicted)] for frame in fit.frames
                     ]
                 done += 1
                 if progress:
                     progress(done, total)
             grids.append(own)
-        clamps[name] = {"hang": ratio, "grids": grids, "outlines": outlines}
+        clamps[name] = {"hang": ratio, "grids": grids, "silhouettes": silhouettes}
     return {"times": list(frames), "clamps": clamps}

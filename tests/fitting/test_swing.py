@@ -31,7 +31,7 @@ def twin(dx):
 
 
 def test_a_swing_follows_the_equilibrium_and_its_derivatives():
-    """It starts in the held pose, falls, and its surface changes with its unknowns as differences say."""
+    """It starts in the held pose, falls, and its surface changes with its unknowns as finite differences do."""
     motion, shape = swing(0.015), np.array([RATIO_OF_TWIN, SHARE, RELEASED])
     before, later = (SwingingBody(motion, time) for time in (0.0, 0.1))
     np.testing.assert_allclose(before.positions(shape), motion.resting.positions(shape), atol=4e-4)
@@ -102,7 +102,7 @@ def test_a_record_of_a_swing_has_both_results():
     assert clamp["hang"] == RATIO_OF_TWIN == pytest.approx(grid["predicted"]["ratio"])
     assert grid["predicted"]["contour_rms"] < 1 and len(grid["fitted"]["contour_rms_by_frame"]) == 1
     assert 0.005 < grid["predicted"]["sag"] < 0.02
-    line = np.array(max(clamp["outlines"][0], key=len))
+    line = np.array(max(clamp["silhouettes"][0], key=len))
     assert line[:, 0].min() < np.nonzero(frames[TIMES[1]].mask.any(0))[0][0] + 2
     with pytest.raises(ValueError, match=r"swings\.a\.body"):
         StillsConfig(bodies={"beam": BODY}, swings={"a": own.plain() | {"body": "bean"}})

@@ -33,8 +33,9 @@ def test_a_beam_predicts_another_record(tmp_path, kernels):
     )
     targets = [f"{RESULTS}/stills.csv", f"{RESULTS}/figures/stills.png", f"{RESULTS}/swings/fall.json"]
     plan = project.plan(*settings, *targets)
-    assert plan == {"still_fit": 2, "stills_table": 1, "stills": 1, "swing": 1}
-    assert str(root / "swing/label_00.png").endswith(plan.one("swing").inputs[1])
+    rules = {"still_fit": 2, "stills_table": 1, "stills": 1, "swing": 1}
+    assert {rule: jobs for rule, jobs in plan.items() if rule != "kernels"} == rules
+    assert any(name.endswith("swing/label_00.png") for name in plan.one("swing").inputs)
     project.run(*settings, *targets)
     fitted, given = (
         json.loads((project.root / f"{RESULTS}/stills/{name}.json").read_text()) for name in bodies

@@ -38,7 +38,7 @@ def specimen_figure(fit: SpecimenFit) -> Figure:
 
 @styled
 def swing_figure(result: Mapping[str, Any]) -> Figure:
-    """Outlines of a released body at the times of its silhouettes, predicted on the finest grid, and their distances.
+    """Predicted silhouettes of a released body on the finest grid, and their distances from the observed ones.
 
     Args:
         result: of `fitting.swing.swing_record`.
@@ -47,7 +47,7 @@ def swing_figure(result: Mapping[str, Any]) -> Figure:
     pictures, distances = figure.subplots(1, 2, width_ratios=(3, 2))
     clamps, times = result["clamps"], [1e3 * time for time in result["times"]]
     best = min(clamps.values(), key=lambda own: own["grids"][-1]["predicted"]["contour_rms"])
-    for lines, time, colour in zip(best["outlines"], times, SEQUENCE, strict=False):
+    for lines, time, colour in zip(best["silhouettes"], times, SEQUENCE, strict=False):
         outer = np.array(max(lines, key=len))
         pictures.plot(*outer.T, color=colour, linewidth=0.8, label=f"{time:.0f} ms")
     pictures.set_aspect("equal")
