@@ -37,7 +37,8 @@ from neuma_lib.mechanics.combinations import named_combinations
 from neuma_lib.methods.base import Problem
 from neuma_lib.methods.spring_gaus.method import SpringGaus
 from neuma_lib.methods.training import Training
-from neuma_lib.sim.colliders import contact_radius
+from neuma_lib.sim.clamps import Clamp
+from neuma_lib.sim.colliders import Collider, contact_radius
 from neuma_lib.sim.rigid_flight import rigid_flight
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
@@ -187,6 +188,29 @@ def test_two_videos_have_the_constants_in_common_and_a_motion_each():
     written = both.as_dict()
     assert written["start"]["v0"] == list(V0) and len(written["further_videos"]) == 1
     assert "further_videos" not in alone.as_dict()
+
+
+def test_videos_have_their_own_colliders_and_clamps():
+    """A press and a hang: the true stiffness, and images that the obstacles of the other video do not explain."""
+    families, truth = {"hencky": ELASTIC}, law("hencky", E=3e4, nu=0.4)
+    still, poses = (0.0, 0.0, 0.0), ((0.0, 0.5), (0.12, 0.3), (0.24, 0.5))
+    platen = Collider("box", (0.2, 0.02, 0.2), keyframes=tuple((t, (0.5, y, 0.5), still) for t, y in poses))
+    clamp = Clamp((0.3, 0.32, 0.3), (0.7, 0.5, 0.7), release=0.15)
+    models = [replace(MODEL, colliders=(platen,)), replace(MODEL, clamps=(clamp,))]
+    videos = []
+    for model in models:
+        body = ball()
+        seen = observe(body, still, FRAMES, truth, model)
+        seen = Observation(seen.frames, seen.images + pixel_noise(seen.images), seen.cameras)
+        videos.append((known(body, v0=still), body, seen))
+    chosen = settings(families, covariance_from="elastic", pyramid=(8, 32))
+    own, swapped = (
+        identify(each, *videos[0], chosen, other_videos=videos[1:]).best for each in (models, models[::-1])
+    )
+    assert own.values["E"] == pytest.approx(3e4, rel=0.03)
+    assert swapped.loss > 10 * own.loss
+    with refused("model"):
+        identify([*models, MODEL], *videos[0], chosen, other_videos=videos[1:])
 
 
 def test_videos_count_alike_however_long():
