@@ -54,10 +54,10 @@ class Beam:
     gravity: float = 9.81
     load: float = 0.0
 
-    def mesh(self, size: float | None = None) -> Hexahedra:
-        """Elements of about a size [m], by default the height. Those at x < 0 are clamped."""
+    def mesh(self) -> Hexahedra:
+        """Elements of about half the height. Those at x < 0 are clamped."""
         sizes = self.length, self.height, self.width
-        counts = [max(1, round(own / (size or self.height))) for own in sizes]
+        counts = [max(1, round(2 * own / self.height)) for own in sizes]
         along = np.linspace(0.0, self.length, counts[0] + 1)
         sides = [np.linspace(-own / 2, own / 2, n + 1) for own, n in zip(sizes[1:], counts[1:], strict=True)]
         return Hexahedra.of_blocks(

@@ -98,8 +98,8 @@ def test_the_sag_of_a_beam(cells):
 
 
 def test_a_beam_that_is_released_in_its_equilibrium_stays_there():
-    """Positions and deformation of the particles are those of the equilibrium on the mesh. Both methods differ in the
-    sag by a few per cent, with which the beam may vibrate."""
+    """Positions and deformation of the particles are those of the equilibrium on the mesh. The sag of the particles is
+    up to 8 % larger at 3 cells, and the beam vibrates about it with that amplitude, instead of the whole sag."""
     spec = {"elasticity": {"name": "neo_hookean", "E": 2.7e5, "nu": 0.4}}
     mesh, gravity = BEAM.mesh(), (0.0, -BEAM.gravity, 0.0)
     rest = solve_equilibrium(mesh, analytic_law(spec, 1e-3), BEAM.density, gravity, [BEAM.clamp])
@@ -107,8 +107,8 @@ def test_a_beam_that_is_released_in_its_equilibrium_stays_there():
     end = (specimen.places[:, 0] > 0.09).numpy()
     _, x = released(specimen, specimen.law(spec), 0.15, 0.01)
     drop = (specimen.places[:, 1] - x[..., 1])[:, end].mean(1)
-    assert 5e-3 < drop[0] < 8e-3  # 6.5 mm in docs/results/silicone_motion.md
-    assert float((drop / drop[0] - 1).abs().max()) < 0.08
+    assert 5.8e-3 < drop[0] < 6.6e-3
+    assert 0 <= float(drop.min() / drop[0] - 1) + 1e-3 and float(drop.max() / drop[0]) < 1.17
     with refused("clamp", problem="0 of its faces"):
         clamped_body(mesh, Clamp((0.3, -1, -1), (0.4, 1, 1)), 1000.0, gravity, spec, 0.01)
 
