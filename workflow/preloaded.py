@@ -1,8 +1,8 @@
 """A process that has imported the libraries and is forked for each script of a job.
 
 Imports, torch's above all, take 2 core seconds, more than the work of most jobs. A run of Snakemake on one machine
-therefore starts one process that imports the libraries of others, and no module of this project. A script
-(`workflow/interpreter/sitecustomize.py`) hands it its arguments, folder, environment and standard streams. It forks, its
+therefore starts one process that imports the libraries of others, and no module of this project. A script hands it its
+arguments, folder, environment and standard streams (`workflow/interpreter/sitecustomize.py`). The process forks, its
 copy runs the script, and the script's first process waits for the status of that copy. So each job still has a process
 of its own, which starts from the same state.
 

@@ -37,7 +37,13 @@ def start(tmp_path):
         script = tmp_path / ".snakemake" / "scripts" / "job.py"
         script.parent.mkdir(parents=True, exist_ok=True)
         script.write_text(text)
-        known = {**os.environ, "PYTHONPATH": str(INTERPRETER), "OWN": "7", "OMP_NUM_THREADS": "1", **variables}
+        known = {
+            **os.environ,
+            "PYTHONPATH": str(INTERPRETER),
+            "OWN": "7",
+            "OMP_NUM_THREADS": "1",
+            **variables,
+        }
         return subprocess.Popen(
             [sys.executable, script, *words],
             cwd=tmp_path,
@@ -58,7 +64,9 @@ def test_a_script_finds_its_arguments_folder_environment_and_libraries(server, s
     assert json.loads(output) == [[script, "one", "two"], str(tmp_path), "7", server.pid, True, "__main__"]
 
 
-@pytest.mark.parametrize("variables", [{"OMP_NUM_THREADS": "2"}, {preloaded.VARIABLE: f"/none:{sys.executable}"}])
+@pytest.mark.parametrize(
+    "variables", [{"OMP_NUM_THREADS": "2"}, {preloaded.VARIABLE: f"/none:{sys.executable}"}]
+)
 def test_a_script_with_threads_or_without_a_server_runs_as_usual(server, start, variables):
     output, _ = start(REPORT, **variables).communicate(timeout=20)
     *_, parent, has_library, name = json.loads(output)
