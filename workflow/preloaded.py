@@ -6,11 +6,13 @@ arguments, folder, environment and standard streams (`workflow/interpreter/sitec
 copy runs the script, and the script's first process waits for the status of that copy. So each job still has a process
 of its own, which starts from the same state.
 
-A script runs as usual where there is no such process: on a cluster, with a GPU, and with several threads.
+A script runs as usual where there is no such process: on a cluster, and with a GPU. Libraries read their number of
+threads when they are loaded, hence those of a copy have one, whatever the job has: `neuma_lib.threads` uses the others.
 """
 
 from __future__ import annotations
 
+import atexit
 import gc
 import json
 import os
@@ -22,6 +24,8 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
+import traceback
 from collections.abc import Mapping
 from contextlib import suppress
 from importlib import import_module
@@ -136,6 +140,26 @@ def _become(job: Mapping, streams: list[int]) -> list[str]:
     return job["words"]
 
 
+def _run(words: list[str]) -> None:
+    """Run a script, and end this process without giving back the memory of the libraries piece by piece."""
+    sys.argv, sys.path[0] = words, str(Path(words[0]).parent)
+    status = 0
+    try:
+        runpy.run_path(words[0], run_name="__main__")
+    except SystemExit as end:
+        status = end.code if isinstance(end.code, int) else int(end.code is not None)
+        if not isinstance(end.code, int | None):
+            print(end.code, file=sys.stderr)
+    except BaseException:
+        traceback.print_exc()
+        status = 1
+    threading._shutdown()
+    atexit._run_exitfuncs()
+    for stream in (sys.stdout, sys.stderr):
+        stream.flush()
+    os._exit(status)
+
+
 def main(number: int, libraries: list[str]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     words = []
@@ -151,8 +175,7 @@ def main(number: int, libraries: list[str]) -> None:
             if not words:
                 shutil.rmtree(folder, ignore_errors=True)
     if words:
-        sys.argv, sys.path[0] = words, str(Path(words[0]).parent)
-        runpy.run_path(words[0], run_name="__main__")
+        _run(words)
 
 
 if __name__ == "__main__":

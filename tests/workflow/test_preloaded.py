@@ -64,11 +64,8 @@ def test_a_script_finds_its_arguments_folder_environment_and_libraries(server, s
     assert json.loads(output) == [[script, "one", "two"], str(tmp_path), "7", server.pid, True, "__main__"]
 
 
-@pytest.mark.parametrize(
-    "variables", [{"OMP_NUM_THREADS": "2"}, {preloaded.VARIABLE: f"/none:{sys.executable}"}]
-)
-def test_a_script_with_threads_or_without_a_server_runs_as_usual(server, start, variables):
-    output, _ = start(REPORT, **variables).communicate(timeout=20)
+def test_a_script_without_a_server_runs_as_usual(start):
+    output, _ = start(REPORT, **{preloaded.VARIABLE: f"/none:{sys.executable}"}).communicate(timeout=20)
     *_, parent, has_library, name = json.loads(output)
     assert (parent, has_library, name) == (os.getpid(), False, "__main__")
 
@@ -86,6 +83,8 @@ def test_a_server_without_its_libraries_leaves_scripts_alone(monkeypatch, start)
     [
         ("", 0),
         ("import sys; sys.exit(3)", 3),
+        ("import sys; sys.exit()", 0),
+        ("import sys; sys.exit('bad')", 1),
         ("1 / 0", 1),
         ("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)", -signal.SIGSEGV),
     ],
@@ -94,7 +93,20 @@ def test_the_status_of_a_script_is_that_of_its_copy(server, start, text, status)
     script = start(text)
     _, errors = script.communicate(timeout=20)
     assert script.returncode == status
-    assert ("ZeroDivisionError" in errors) == (text == "1 / 0")
+    assert ("ZeroDivisionError" in errors, "bad\n" in errors) == (text == "1 / 0", "'bad'" in text)
+
+
+def test_the_end_of_a_copy_is_that_of_a_process(server, start, tmp_path):
+    text = """
+import atexit, tempfile, threading, time
+folder = tempfile.TemporaryDirectory(dir=".")
+atexit.register(print, "at exit")
+threading.Thread(target=lambda: (time.sleep(0.2), print("thread"))).start()
+print("end", end=" ")
+"""
+    output, _ = start(text).communicate(timeout=20)
+    assert output == "end thread\nat exit\n"
+    assert [file.name for file in tmp_path.iterdir()] == [".snakemake"]
 
 
 def test_scripts_run_at_the_same_time(server, start):

@@ -70,7 +70,6 @@ _script = next(
 if _script and os.environ.get("NEUMA_GPUS", "").isdigit() and "CUDA_VISIBLE_DEVICES" not in os.environ:
     _gpu, _claim = claim_gpu(max(1, int(os.environ["NEUMA_GPUS"])))
     os.environ["CUDA_VISIBLE_DEVICES"] = str(_gpu)
-# Libraries read the number of threads when they are loaded, and the preloaded process has one.
 _server, _, _python = os.environ.get("NEUMA_PRELOADED", "").partition(":")
-if _script and _server and _python == sys.executable and os.environ.get("OMP_NUM_THREADS") == "1":
+if _script and _python == sys.executable:
     run_preloaded(_server, sys.orig_argv[_script:])
