@@ -3,8 +3,8 @@
 Imports, torch's above all, take 2 core seconds, more than the work of most jobs. A run of Snakemake on one machine
 therefore starts one process that imports the libraries of others, and no module of this project. A script hands it its
 arguments, folder, environment and standard streams (`workflow/interpreter/sitecustomize.py`). The process forks, its
-copy runs the script, and the script's first process waits for the status of that copy. So each job still has a process
-of its own, which starts from the same state.
+copy runs the script, and the first process waits for the status of that copy. So each job still has its own process,
+and all start from the same state.
 
 A script runs as usual where there is no such process: on a cluster, and with a GPU. Libraries read their number of
 threads when they are loaded, hence those of a copy have one, whatever the job has: `neuma_lib.threads` uses the others.

@@ -1,6 +1,6 @@
 """Types of Warp for the simulator: numbers, constants of a model, and the arguments of kernels by their names.
 
-What an argument is called says what it is, in all kernels and functions. Only exceptions have an annotation.
+An argument has the same type in all kernels and functions that have one of its name. Only exceptions have an annotation.
 """
 
 # No `from __future__ import annotations` here: Warp reads the annotations of structs as objects.

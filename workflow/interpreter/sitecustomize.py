@@ -50,7 +50,7 @@ def run_preloaded(server: str, words: list[str]) -> None:
         connection.sendall(text)
         if not connection.recv(1):  # it could not import its libraries
             return
-        # From here on Ctrl-C is for the copy, which may want to say something before it ends.
+        # From here on Ctrl-C is for the copy, which may write a message before it ends.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         connection.sendall(b"\1")
     except OSError:

@@ -66,7 +66,9 @@ THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "
 INTERPRETER = ROOT / "workflow" / "interpreter"
 os.environ.update(
     {
-        "PYTHONPATH": os.pathsep.join([str(INTERPRETER), str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]),
+        "PYTHONPATH": os.pathsep.join(
+            [str(INTERPRETER), str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
+        ),
         "NEUMA_KERNEL_CACHE": str(Path(SETTINGS.kernel_cache).resolve()),
         **{name: os.environ.get(name, "1") for name in THREAD_LIMITS},
     }
