@@ -1,17 +1,16 @@
 """Types of Warp for the simulator: numbers, constants of a model, and the arguments of kernels by their names.
 
-An argument has the same type in all kernels and functions that have one of its name. Only exceptions have an annotation.
+Arguments of one name have one type in all kernels and functions. Only exceptions have an annotation.
 """
 
 # No `from __future__ import annotations` here: Warp reads the annotations of structs as objects.
 import functools
-import inspect
-from collections.abc import Callable
 from types import SimpleNamespace
 
 import torch
 import warp as wp
 
+from neuma_lib import device
 from neuma_lib.sim.bodies import MAX_RANGES
 from neuma_lib.sim.clamp_kernels import hold_type
 from neuma_lib.sim.contact_kernels import obstacle_type
@@ -101,26 +100,5 @@ def _argument_types(dtype: torch.dtype, axes_of_steps: int) -> dict[str, type]:
 
 
 def typed(dtype: torch.dtype, axes_of_steps: int) -> SimpleNamespace:
-    """Decorators ``func``, ``func_native(source)`` and ``kernel(module)`` that add types of arguments by their names.
-
-    Args:
-        dtype: precision.
-        axes_of_steps: of arrays of steps: 2, or 1 in functions that get one step.
-    """
-
-    def annotate(function: Callable) -> Callable:
-        types, own = _argument_types(dtype, axes_of_steps), function.__annotations__
-        names = inspect.signature(function).parameters
-        # Warp reads their order, too.
-        function.__annotations__ = {n: own[n] if n in own else types[n] for n in names} | own
-        return function
-
-    def kernel(module: str) -> Callable[[Callable], wp.Kernel]:
-        return lambda function: wp.kernel(annotate(function), enable_backward=False, module=module)
-
-    # Warp finds the type of a native function's result if its only decorator is called func_native.
-    return SimpleNamespace(
-        func=lambda function: wp.func(annotate(function)),
-        func_native=lambda source: lambda function: wp.func_native(source)(annotate(function)),
-        kernel=kernel,
-    )
+    """`device.typed` for a precision and arrays of steps with two axes, or one in functions that get one step."""
+    return device.typed(_argument_types(dtype, axes_of_steps))
