@@ -59,7 +59,6 @@ STEPS = 32  # the steps of a video are a multiple of this
 class Lab:
     """A hidden material and its object, which films launches."""
 
-    model: MPM
     law: dict[str, Any]
     truth: Reconstruction
     body: Reconstruction
@@ -68,6 +67,7 @@ class Lab:
     @torch.no_grad()
     def film(
         self,
+        model: MPM,
         truth: Reconstruction,
         body: Reconstruction,
         velocity: Sequence[float],
@@ -77,15 +77,14 @@ class Lab:
         """An estimate of the initial motion, the reconstruction at the start, and the video."""
         frames = tuple(round(k * steps / (FRAMES - 1)) for k in range(FRAMES))
         start = truth.state(velocity, spin)
-        path = rollout(
-            self.model, analytic_law(self.law, self.model.dt), start, steps=steps, frames=frames, total=True
-        )
+        path = rollout(model, analytic_law(self.law, model.dt), start, steps=steps, frames=frames, total=True)
         like = Cameras(torch.eye(4)[None], torch.eye(3)[None], PIXELS, PIXELS)
         cameras = as_cameras(video_views(path.x.flatten(0, 1).numpy(), 1, PIXELS, PIXELS), like)
         images = truth.particle_gs(cameras)(path.x, path.stretch)
         axes = cameras.viewmats[0, :3, :3].double().numpy()
         centre = (body.mass @ body.x0 / body.mass.sum()).double().numpy()
-        exact = InitialMotion(np.array(velocity), np.array(spin), centre, axes, STD)
+        std = np.zeros(6) if model.clamps else STD
+        exact = InitialMotion(np.array(velocity), np.array(spin), centre, axes, std)
         motion = exact.moved(self.random.standard_normal(6))
         return motion, body, Observation(frames, images, cameras)
 
@@ -97,7 +96,7 @@ class Lab:
         R = Rotation.from_rotvec(own.get("rotation", (0.0, 0.0, 0.0))).as_matrix()
         centre = (own["center"][0], own["height"], own["center"][1])
         at = [placed(each, R, centre) for each in (self.truth, self.body)]
-        return self.film(*at, own["velocity"], own["spin"], own["steps"])
+        return self.film(option.experiment.model, *at, own["velocity"], own["spin"], own["steps"])
 
 
 def solid(scene, count: int, seed: int) -> Reconstruction:
@@ -121,16 +120,17 @@ def measure(settings: Config, name: str, count: int, random: int, seed: int) -> 
     model = MPM(GRID, COARSER * scene.dt, simulation.gravity, simulation.boundary, simulation.contact)
     steps = STEPS * max(1, round(scene.steps / COARSER / STEPS))
     bodies = [solid(scene, TRUE, 1000), solid(scene, RECONSTRUCTED, 1)]
-    lab = Lab(model, law, *bodies, np.random.default_rng([seed, 5]))
+    lab = Lab(law, *bodies, np.random.default_rng([seed, 5]))
     truth = physical({key: value for part in law.values() for key, value in part.items() if key != "name"})
-    first = lab.film(*bodies, scene.velocity, scene.spin, steps)
+    first = lab.film(model, *bodies, scene.velocity, scene.spin, steps)
 
     def summary(fit: FamilyFit) -> dict[str, Any]:
         logs = {key: math.log(value / truth[key]) for key, value in physical(fit.values).items()}
         return {"std": stds(fit, chosen), "error": logs}
 
     def joint(option: Option) -> dict[str, Any]:
-        both = identify(model, *first, chosen, other_videos=[lab.repeat(option)])
+        models = [model, option.experiment.model]
+        both = identify(models, *first, chosen, other_videos=[lab.repeat(option)])
         return {
             "settings": option.settings,
             "predicted": stds(option.forecast.fit, chosen),

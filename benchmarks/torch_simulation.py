@@ -38,7 +38,7 @@ def step(model, regions, x, v, F, C, stuck, mass, vol0, time=0.0, clamp=None, ov
     d = (offset - f[:, None]) * dx
     node = base[:, None] + offset
     count = max(1, len(bodies))
-    body = torch.arange(count).repeat_interleave(torch.tensor(bodies or (len(x),)))
+    body = torch.arange(count).repeat_interleave(torch.tensor(bodies or (len(x),))).to(x.device)
     flat = ((body[:, None] * n + node[..., 0]) * n + node[..., 1]) * n + node[..., 2]
 
     A = mass[:, None, None] * C - (4 * dt / dx**2) * vol0[:, None, None] * tau

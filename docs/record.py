@@ -3,8 +3,8 @@
 python -m docs.record            # after: snakemake --cores 2 tables figures random results/table1_converged.csv
 python -m docs.record --configfile config/studies/three_chains.yaml     # after the same with this option
 
-The first line of a recorded table names date, commit and machine. Text between `<!-- name -->` and `<!-- /name -->` is
-generated: `table1` in README.md, `verdicts` in docs/results/claims.md, `figures` in docs/results/figures.md.
+The first line of a recorded table names date, commit, grid and machine. `docs.recorded` writes its numbers into the
+pages. The text `figures` of docs/results/figures.md is generated here, from files that are not copied.
 """
 
 from __future__ import annotations
@@ -12,48 +12,20 @@ from __future__ import annotations
 import argparse
 import datetime
 import platform
-import re
 import shutil
 import subprocess
-from itertools import dropwhile, takewhile
 from math import nan
 from pathlib import Path
 from statistics import mean, median
 
 from PIL import Image
 
+from docs.recorded import MADE_BY, filled, update
 from neuma_lib.evaluation.text_tables import as_markdown
 from neuma_lib.io.files import read_json
-from neuma_lib.paper.claims import VERDICTS
 from neuma_lib.paper.figures import image_quality, lora_alphav, material_response
 from neuma_lib.paper.image_grid import load_image_grid
-from neuma_lib.paper.published import PAPER
-from neuma_lib.paper.tables import ABSORBED
-
-MADE_BY = {
-    "table1": "tables figures",
-    "table2": "tables figures",
-    "table3": "tables figures",
-    "table4": "tables figures",
-    "table5": "tables figures",
-    "uneven_mass": "tables figures",
-    "ablation_gradients": "tables figures",
-    "table1_converged": "results/table1_converged.csv",
-    "random": "random",
-    "initial_states": "tables figures",
-    "yardstick": "results/yardstick.csv",
-    "stress": "results/stress.csv",
-    "letters": "results/letters.csv",
-    "views": "results/views.csv",
-    "outside": "results/outside.csv",
-    "identified": "results/identified.csv",
-    "calibration": "calibration",
-    "table1_systems": "results/table1_systems.csv",
-    "table2_systems": "results/table2_systems.csv",
-}
-"""Tables that are recorded, and the target of Snakemake that makes them."""
-VERDICT_HEAD = f"| {' | '.join(VERDICTS[:2])} |"
-"""How the head of a table of verdicts begins."""
+from neuma_lib.project import loading
 
 WIDTH = 1400
 """Of figures on a page [px]; in print they are larger."""
@@ -73,75 +45,12 @@ def head() -> str:
     return done.stdout.strip() or "unknown"
 
 
-def filled(page: str, name: str, content: str) -> str:
-    """A page with other content between `<!-- name -->` and `<!-- /name -->`.
-
-    Raises:
-        SystemExit: the page has not exactly one such place.
-    """
-    place = re.compile(rf"(<!-- {name} -->\n).*?(<!-- /{name} -->)", re.DOTALL)
-    page, count = place.subn(lambda match: f"{match[1]}{content.strip()}\n{match[2]}", page)
-    if count != 1:
-        raise SystemExit(f"a page has {count} places <!-- {name} --> ... <!-- /{name} -->; it needs one")
-    return page
-
-
-def fill(page: Path, name: str, content: str) -> None:
-    """Replace the generated text `name` in a file."""
-    page.write_text(filled(page.read_text(), name, content))
-
-
-def overview(markdown: str) -> str:
-    """The RMSE of a recorded table for the README: a mean for each column, the average with its spread."""
-    origin = ", ".join(markdown.split(", ")[:2])
-    lines = dropwhile(lambda line: not line.startswith("| Method |"), markdown.splitlines())
-    head, _, *rows = (line[2:-2].split(" | ") for line in takewhile(bool, lines))
-    last = head.index("Average")
-    short = [
-        [
-            re.sub(r" \(\d+\)$", "", row[0]),
-            *(re.sub(r" ± [\d.]+", "", cell) for cell in row[1:last]),
-            row[last],
-        ]
-        for row in rows
-    ]
-    source = f"{origin}: [all columns, spreads and commands](docs/results/table1.md)."
-    return "\n".join([*as_markdown(head[: last + 1], short, numbers=True), "", source])
-
-
-def verdicts(tables: dict[str, str]) -> str:
-    """Verdicts of the recorded tables as one Markdown table, and how much closer laws are than the true law.
-
-    Tables that are not recorded, or recorded without verdicts, are listed.
-
-    Args:
-        tables: name -> its Markdown.
-    """
-    rows, absorbed = [], []
-    for name, markdown in tables.items():
-        link = f"[{name}]({name}.md)"
-        lines = iter(markdown.splitlines())
-        for line in lines:
-            if line.startswith(VERDICT_HEAD):
-                next(lines)  # the rule below the header
-                for row in takewhile(lambda line: line.startswith("|"), lines):
-                    cells = row[2:-2].split(" | ")
-                    rows.append([link, *cells, *["not compared there"] * (len(VERDICTS) - len(cells))])
-            elif line.startswith(ABSORBED):
-                absorbed += ["", f"{link}: {line}"]
-    header = ["table", *VERDICTS[:2], "here (RMSE in mm)", VERDICTS[3]]
-    lacking = {
-        "Not recorded": [f"{name} (`snakemake {MADE_BY[name]}`)" for name in MADE_BY if name not in tables],
-        "Recorded by an older version, without verdicts": [
-            name
-            for name, text in tables.items()
-            if name in PAPER and PAPER[name].claims and VERDICT_HEAD not in text
-        ],
-    }
-    missing = [
-        line for what, names in lacking.items() if names for line in ("", f"{what}: {', '.join(names)}.")
-    ]
-    return "\n".join([*as_markdown(header, rows), *absorbed, *missing])
+def grid(overlay: str | None) -> int:
+    """Cells along an axis of the simulation of a run."""
+    raw = loading.read_yaml("config/config.yaml")
+    if overlay:
+        raw = loading.merged(raw, loading.read_yaml(overlay))
+    return loading.load(raw, ".").simulation.grid
 
 
 def figure_numbers(folder: Path) -> str:
@@ -203,8 +112,6 @@ def figure_numbers(folder: Path) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--results", default="results", help="folder of the run")
-    parser.add_argument("--out", default="docs/results", help="folder to write to")
-    parser.add_argument("--readme", default="README.md", help="page with the place table1")
     parser.add_argument(
         "--machine", default=f"2 cores of {processor()}, no GPU", help="what the run was computed on"
     )
@@ -213,14 +120,18 @@ def main() -> None:
     )
     parser.add_argument("--commit", default=head(), help="code of the run")
     parser.add_argument("--configfile", help="settings of the run that lay over the defaults")
+    parser.add_argument("--config", help="option --config of the run, such as 'random={seed: 12, count: 12}'")
     options = parser.parse_args()
-    results, out = Path(options.results), Path(options.out)
-    out.mkdir(parents=True, exist_ok=True)
+    results, out = Path(options.results), Path("docs/results")
+    settings = "default settings (`config/config.yaml`)"
+    settings += f" with `{options.configfile}`" if options.configfile else ""
+    today = datetime.date.today()
     origin = (
-        f"{datetime.date.today()}, commit {options.commit}, {options.machine}, default settings (`config/config.yaml`)"
-        + (f" with `{options.configfile}`" if options.configfile else "")
+        f"{today}, commit {options.commit}, {grid(options.configfile)}³ cells, {options.machine}, {settings}"
     )
-    command = f"snakemake --configfile {options.configfile} --" if options.configfile else "snakemake"
+    given = f" --configfile {options.configfile}" if options.configfile else ""
+    given += f" --config '{options.config}'" if options.config else ""
+    command = f"snakemake{given} --" if given else "snakemake"
     for name in options.tables:
         source = results / f"{name}.md"
         if source.exists():
@@ -231,15 +142,12 @@ def main() -> None:
         (out / "figures").mkdir(exist_ok=True)
         with Image.open(picture) as image:
             size = WIDTH, round(image.height * WIDTH / image.width)
-            small = image.convert("RGB").resize(size, Image.LANCZOS)
+            small = image.convert("RGB").resize(size, Image.Resampling.LANCZOS)
         small.save(out / "figures" / picture.name, optimize=True)
-
-    recorded = {name: (out / f"{name}.md").read_text() for name in MADE_BY if (out / f"{name}.md").exists()}
-    if "table1" in options.tables and (results / "table1.md").exists():
-        fill(Path(options.readme), "table1", overview(recorded["table1"]))
-    fill(out / "claims.md", "verdicts", verdicts(recorded))
     if numbers := figure_numbers(results / "figures"):
-        fill(out / "figures.md", "figures", numbers)
+        page = out / "figures.md"
+        page.write_text(filled(page.read_text(), "figures", numbers))
+    update(Path())
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ from neuma_lib.cli import main
 from neuma_lib.io.files import write_json
 from neuma_lib.project import checks
 from neuma_lib.project.project import Project
+from neuma_lib.project.scaffold import next_scene
 
 ROOT = Path(__file__).resolve().parents[1]
 core = pytest.mark.core
@@ -250,6 +251,35 @@ def test_a_chosen_launch_becomes_a_scene_of_the_same_material(project, capsys):
     assert main(["new", "scene", "Third", "--from", str(folder), "--rank", "2"]) == 1
     assert main(["new", "scene", "Third", "--from", "results/ClayCat"]) == 1
     assert "neuma next" in capsys.readouterr().err
+
+
+@core
+def test_a_chosen_press_or_hang_becomes_a_scene_with_its_own_obstacles(project, capsys):
+    """A press keeps the obstacles of the scene. A launch after a hang has no clamp."""
+    still = [0.0, 0.0, 0.0]
+    rest = {"height": 0.3, "center": [0.5, 0.5], "velocity": still, "spin": still, "steps": 256}
+    platen = {"shape": "box", "size": [0.2, 0.02, 0.2], "keyframes": [[0.0, [0.5, 0.8, 0.5], still]]}
+    ramp = {"shape": "plane", "centre": [0.5, 0.05, 0.5], "axis": [0.3, 1.0, 0.0]}
+    clamp = {"lowest": [0.2, 0.4, 0.2], "highest": [0.8, 0.6, 0.8], "release": 0.1}
+    folder = chosen(project, "press", **rest, colliders=[platen])
+    duck = yaml.safe_dump({"scenes": {"JellyDuck": {"colliders": [ramp]}}})
+    (project / "config" / "ramp.yaml").write_text(duck)
+    settings, root = Project.find(project, ["config/ramp.yaml"])
+    press = next_scene(root, "Press", settings, folder)
+    write_json(
+        folder / "next.json", {"candidates": [{"kind": "hang", "settings": rest | {"clamps": [clamp]}}]}
+    )
+    hang = next_scene(root, "Hang", settings, folder)
+    both, _ = Project.find(project, ["config/ramp.yaml", press])
+    assert [own["shape"] for own in both.obstacles("Press")["colliders"]] == ["plane", "box"]
+    assert both.obstacles("JellyDuck")["colliders"] == both.obstacles("Press")["colliders"][:1]
+    held, _ = Project.find(project, ["config/ramp.yaml", hang])
+    assert held.obstacles("Hang")["clamps"] == [clamp] and held.video_scenes("JellyDuck")[1:] == ["Hang"]
+    first = held.model_copy(update={"scenes": held.scenes | {"JellyDuck": held.scenes["Hang"]}})
+    write_json(folder / "next.json", {"candidates": [{"kind": "launch", "settings": rest}]})
+    assert (
+        yaml.safe_load(next_scene(root, "Free", first, folder).read_text())["scenes"]["Free"]["clamps"] == []
+    )
 
 
 @core

@@ -17,9 +17,11 @@ from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.io.files import listed, read_json
 from neuma_lib.io.images import load_videos
 from neuma_lib.io.particles import load_reconstruction
+from neuma_lib.io.simulator import simulator
 from neuma_lib.mechanics.law import Law
 from neuma_lib.methods.base import FitRun, Method, method_of
 from neuma_lib.methods.model import LawOnGrid, MotionModel
+from neuma_lib.sim.model import MPM
 from neuma_lib.sim.state import State
 from neuma_lib.splatting.observation import Observation
 from workflow.provenance import fingerprint
@@ -56,6 +58,12 @@ class FitStage(FitRun):
 
     def log(self, text: str) -> None:
         self._stage.log(text)
+
+
+def simulators(params) -> list[MPM]:
+    """The simulator of each of the scenes of a job."""
+    several = params.simulation if isinstance(params.simulation, list) else [params.simulation]
+    return [simulator(own) for own in several]
 
 
 def filmed_bodies(

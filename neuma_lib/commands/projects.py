@@ -1,4 +1,4 @@
-"""Commands ``demo``, ``new``, ``check``, ``view``, ``clip`` and ``timings``."""
+"""Commands ``demo``, ``new``, ``select``, ``check``, ``view``, ``clip`` and ``timings``."""
 
 from __future__ import annotations
 
@@ -42,6 +42,14 @@ def add_commands(commands: Any) -> None:
         "capture: create captures/NAME for your own photographs and videos",
         "Writes captures/NAME/capture.yaml and creates the folders of the files. Prints what to do next.",
         argument("name", metavar="NAME", help="name of the capture and of its folder in captures/"),
+    )
+    add_command(
+        commands,
+        _select,
+        "select: mark the object of a capture in a photograph",
+        "Writes select.html into the folder of a capture. Open it in a browser and click the object, or draw a box "
+        "around it: the page shows the line for capture.yaml. Example: neuma select captures/mug",
+        argument("folder", metavar="FOLDER", help="folder of a capture, such as captures/mug"),
     )
     files = f"{CONFIGFILES}; or a capture.yaml. None: config/config.yaml alone"
     add_command(
@@ -138,6 +146,12 @@ def _new_capture(options: argparse.Namespace) -> None:
     print(f"  copy your files to {folder}/photos, {folder}/stills and {folder}/videos")
     print(f"  neuma check {file}")
     print(f"  snakemake --cores 2 results/{options.name}/capture.md")
+
+
+def _select(options: argparse.Namespace) -> None:
+    from neuma_lib.viewer.select import write_select_page
+
+    print(f"Open {write_select_page(options.folder)} in a browser")
 
 
 def _check(options: argparse.Namespace) -> int:

@@ -12,16 +12,19 @@ from neuma_lib.config.base import Section, internal
 class NextConfig(Section):
     """Candidates for the next experiment with an object, and what the lab can do."""
 
-    kinds: tuple[Literal["launch", "turned", "camera"], ...] = Field(
-        ("launch", "turned", "camera"),
+    kinds: tuple[Literal["launch", "turned", "press", "hang", "camera"], ...] = Field(
+        ("launch", "turned", "press", "hang", "camera"),
         min_length=1,
         description="launch: another initial motion of the object; turned: also another orientation at the start; "
-        "camera: a second camera for the first launch",
+        "press: a platen from above; hang: from a clamp around its upper part; camera: a second camera for the first "
+        "video",
     )
     max_height: float = Field(
         0.7, gt=0, description="maximum initial y of the centre of the bounding box [m]"
     )
-    max_speed: float = Field(3.0, ge=0, description="maximum initial speed [m/s]")
+    max_speed: float = Field(
+        3.0, ge=0, description="maximum speed at the start, and of the platen and the clamp [m/s]"
+    )
     max_spin: float = Field(5.0, ge=0, description="maximum initial angular speed [rad/s]; 0: no spin")
     predict: str | None = Field(
         None,
@@ -29,4 +32,6 @@ class NextConfig(Section):
         "possible; null: candidates are ranked by the constants of the material",
     )
     candidates: int = internal(40, "number of candidates", ge=1, le=500)
-    rivals: int = internal(1, "other families to distinguish, those with the lowest scores", ge=0)
+    rivals: int = internal(
+        1, "other families to distinguish, those with the lowest scores, and all that predict as well", ge=0
+    )

@@ -234,6 +234,12 @@ class SceneConfig(Section):
         return self
 
     @model_validator(mode="after")
+    def _clamped_bodies_rest(self) -> SceneConfig:
+        if self.clamps and any((*(self.velocity or ()), *self.spin)):
+            raise ValueError("clamps: a clamped body starts at rest; set velocity and spin to [0, 0, 0]")
+        return self
+
+    @model_validator(mode="after")
     def _frames_ascend(self) -> SceneConfig:
         frames = self.frames
         if frames is not None and (

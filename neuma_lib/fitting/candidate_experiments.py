@@ -1,11 +1,12 @@
-"""Experiments that a lab could do next with an object: other launches, and other cameras."""
+"""Experiments that a lab could do next with an object: launch it, press it, hang it, or film it from elsewhere."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,8 @@ from neuma_lib.config.next import NextConfig
 from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError
+from neuma_lib.sim.clamps import Clamp
+from neuma_lib.sim.colliders import Collider, contact_radius
 from neuma_lib.sim.model import MPM, contact_clearance
 from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.rigid import moved
@@ -26,8 +29,16 @@ from neuma_lib.splatting.viewpoints import Views, framing, ring_directions, vide
 _MARGIN = 0.02  # minimum distance of the body from the walls at the start, as of random scenes [m]
 _MOMENTS = 100  # times of a flight at which contact is tested
 _BEFORE = (0.25, 1.5)  # duration of the flight over that after contact: the initial motion must be visible
+_DURATION = 2.5  # of the longest press, in times that the existing video shows after the contact
+_PRESSED, _PLATEN = (
+    (0.1, 0.45),
+    0.02,
+)  # compression over the height of the body, and half the thickness of the platen [m]
+_CLAMPED = (0.15, 0.35)  # clamped part of the height of the body
+_MIN_CLAMPED = 0.01  # of the particles
 _STEPS = 32  # the steps of a video are a multiple of this, so that its frames are evenly spaced
 _DRAWS = 50  # per candidate
+_REST = {"velocity": [0.0, 0.0, 0.0], "spin": [0.0, 0.0, 0.0]}
 _VIEWS = 5  # of the ring of a rendered scene, without the first
 _AZIMUTHS, _ELEVATIONS = (45, 90, 135, -90), (0, 40)  # of a second camera from the first [degrees]
 REJECTIONS = {
@@ -35,22 +46,26 @@ REJECTIONS = {
     "early": "touch the floor before the initial motion can be seen",
     "late": "touch the floor too late or never",
     "wall": "touch another wall before the floor",
+    "fast": "need a faster platen",
+    "empty": "have too little of the body in the clamp",
 }
 """Why a draw is rejected."""
 
 
 @dataclass(frozen=True)
-class Launch:
-    """A launch of the body.
+class Start:
+    """The start of an experiment with the body.
 
     Attributes:
-        settings: of its scene, in plain values.
+        settings: of its scene, in plain values. Colliders are in addition to those of the existing one.
+        model: simulator constants, with its colliders and clamps.
         body: the body at the start.
         motion: its initial motion.
         steps: simulated steps of its video.
     """
 
     settings: dict[str, Any]
+    model: MPM
     body: Reconstruction
     motion: InitialMotion
     steps: int
@@ -94,7 +109,7 @@ def flight(
     return float(t[first]), None if floor else "wall"
 
 
-def draw_launches(
+def draw_starts(
     model: MPM,
     body: Reconstruction,
     motion: InitialMotion,
@@ -102,44 +117,42 @@ def draw_launches(
     lab: NextConfig,
     count: int,
     seed: int,
-    turn: bool = False,
-) -> list[Launch]:
-    """Launches that the lab can do and that end in a contact with the floor, spread evenly over their parameters.
-
-    Height, velocity, spin and orientation are those of a Halton sequence. The centre is such that the body lands in the
-    middle of the box. Each video shows as much time after the contact as the existing one.
+    kind: str = "launch",
+) -> list[Start]:
+    """Starts of a kind that the lab can do, spread evenly over their parameters, which are those of a Halton sequence.
 
     Args:
-        model: simulator constants.
-        body: the body at the start of the existing launch.
-        motion: initial motion of the existing launch, whose standard deviations the others have, too.
+        model: simulator constants of the existing video.
+        body: the body at the start of the existing video.
+        motion: initial motion of the existing video, whose standard deviations the others have, too.
         steps: steps of its video.
         lab: limits.
-        count: number of launches.
+        count: number of starts.
         seed: of the sequence.
-        turn: whether the body may start in other orientations.
+        kind: one of `STARTS`.
 
     Raises:
-        InputError: no launch is possible within the limits.
+        InputError: none is possible within the limits.
     """
     contact, _ = flight(model, body, motion, steps * model.dt)
     after = steps * model.dt - (contact if math.isfinite(contact) else 0.0)
     draws = qmc.Halton(10, seed=seed).random(_DRAWS * count)
     rejected: Counter[str] = Counter()
-    launches: list[Launch] = []
+    starts: list[Start] = []
+    model = replace(model, clamps=())
     for draw in draws:
-        launch = _launch(model, body, motion, after, lab, draw, turn)
-        if isinstance(launch, str):
-            rejected[launch] += 1
+        start = STARTS[kind](model, body, motion, after, lab, draw)
+        if isinstance(start, str):
+            rejected[start] += 1
         else:
-            launches.append(launch)
-        if len(launches) == count:
-            return launches
-    if not launches:
+            starts.append(start)
+        if len(starts) == count:
+            return starts
+    if not starts:
         counted = ", ".join(f"{number} {REJECTIONS[reason]}" for reason, number in rejected.most_common())
-        problem = f"none of {len(draws)} launches is possible inside the box: {counted}"
-        raise InputError("next", problem, "Raise next.max_height or next.max_speed")
-    return launches
+        problem = f"none of {len(draws)} experiments of the kind {kind} is possible inside the box: {counted}"
+        raise InputError("next", problem, "Raise next.max_height or next.max_speed, or leave the kind out")
+    return starts
 
 
 def _launch(
@@ -149,9 +162,12 @@ def _launch(
     after: float,
     lab: NextConfig,
     draw: np.ndarray,
-    turn: bool,
-) -> Launch | str:
-    """The launch of a point of the unit cube (10,), or why it is rejected."""
+    turn: bool = False,
+) -> Start | str:
+    """The launch of a point of the unit cube (10,), or why it is rejected.
+
+    The body lands in the middle of the box. The video shows as much time ``after`` the contact [s] as the existing one.
+    """
     towards = _direction(draw[2], draw[3])
     towards[1] = -abs(towards[1])
     velocity = [_rounded(lab.max_speed * draw[0] * n) for n in towards]
@@ -168,24 +184,145 @@ def _launch(
     if lowest > lab.max_height:
         return "outside"
     height = _rounded(lowest + (lab.max_height - lowest) * draw[9])
-    # The body lands in the middle of the box.
     g, fall = -model.gravity[1], max(height - size[1] / 2, 0.0)
     time = (velocity[1] + math.sqrt(velocity[1] ** 2 + 2 * g * fall)) / g
-    center = [_rounded(0.5 - velocity[axis] * time) for axis in (0, 2)]
-    own = placed(body, R, (center[0], height, center[1]))
-    mass = own.mass.double() / own.mass.double().sum()
-    start = InitialMotion(
-        np.array(velocity), np.array(spin), (mass @ own.x0.double()).cpu().numpy(), motion.axes, motion.std
-    )
-    low, high = (after * share for share in _BEFORE)
-    contact, reason = flight(model, own, start, high)
+    settings = {
+        "height": height,
+        "center": [_rounded(0.5 - velocity[axis] * time) for axis in (0, 2)],
+        "velocity": velocity,
+        "spin": spin,
+        **({"rotation": rotation} if turn else {}),
+    }
+    return _landing(settings, model, body, motion, after, _BEFORE[1] * after, after)
+
+
+def _press(
+    model: MPM,
+    body: Reconstruction,
+    motion: InitialMotion,
+    after: float,
+    lab: NextConfig,
+    draw: np.ndarray,
+) -> Start | str:
+    """A press of a body that is let go just above the floor, by a platen that moves down and up again."""
+    size = _size(body)
+    radius, g = float(contact_radius(body.vol0).max()), -model.gravity[1]
+    gap = max(radius + g * (1.1 * _BEFORE[0] * after) ** 2 / 2, 1.1 * _MARGIN)
+    height, wait = _rounded(size[1] / 2 + gap), math.sqrt(2 * (gap - radius) / g)
+    top, low = height + size[1] / 2 + _MARGIN + _PLATEN, size[1] * (1 - _between(_PRESSED, draw[0])) + _PLATEN
+    if height > lab.max_height or top + _PLATEN > 1:
+        return "outside"
+    down = after * _between((0.25, 0.5 * _DURATION), draw[1])
+    if top - low > lab.max_speed * down:
+        return "fast"
+    times = [_rounded(wait + k * down) for k in range(3)]
+    poses = [
+        [time, [0.5, _rounded(y), 0.5], [0.0, 0.0, 0.0]]
+        for time, y in zip(times, (top, low, top), strict=True)
+    ]
+    widths = [_rounded(min(0.5 * size[axis] + 0.05, 0.48)) for axis in (0, 2)]
+    platen = {"shape": "box", "size": [widths[0], _PLATEN, widths[1]], "keyframes": poses}
+    settings = {"height": height, "center": [0.5, 0.5], **_REST, "colliders": [platen]}
+    model = replace(model, contact="particles", colliders=(*model.colliders, Collider(**platen)))
+    return _landing(settings, model, body, motion, after, wait + after, 2 * down)
+
+
+def _landing(
+    settings: dict[str, Any],
+    model: MPM,
+    body: Reconstruction,
+    motion: InitialMotion,
+    after: float,
+    latest: float,
+    shown: float,
+) -> Start | str:
+    """The start with some settings, or why it is rejected.
+
+    Args:
+        after: time after the contact in the existing video [s]. The initial motion must be visible for a part of it.
+        latest: time of the first contact [s].
+        shown: time that the video shows after the contact [s].
+    """
+    R = Rotation.from_rotvec(settings.get("rotation", (0.0, 0.0, 0.0))).as_matrix()
+    own = placed(body, R, (settings["center"][0], settings["height"], settings["center"][1]))
+    start = _moving(own, settings, motion.axes, motion.std)
+    contact, reason = flight(model, own, start, latest)
     if reason or not math.isfinite(contact):
         return reason or "late"
-    if contact < low:
+    if contact < _BEFORE[0] * after:
         return "early"
-    steps = _STEPS * math.ceil((contact + after) / model.dt / _STEPS)
-    settings = {"height": height, "center": center, "velocity": velocity, "spin": spin, "steps": steps}
-    return Launch(settings | ({"rotation": rotation} if turn else {}), own, start, steps)
+    steps = _in_steps(model, contact + shown)
+    return Start({**settings, "steps": steps}, model, own, start, steps)
+
+
+def _hang(
+    model: MPM,
+    body: Reconstruction,
+    motion: InitialMotion,
+    after: float,
+    lab: NextConfig,
+    draw: np.ndarray,
+) -> Start | str:
+    """A hang from a clamp around the upper part of the body, which moves to and fro and may then let go."""
+    size = _size(body)
+    lowest = size[1] / 2 + _MARGIN
+    if lowest > lab.max_height:
+        return "outside"
+    height = _rounded(lowest + (lab.max_height - lowest) * draw[0])
+    own = placed(body, np.eye(3), (0.5, height, 0.5))
+    corner = [0.5 - size[0] / 2, height + size[1] * (0.5 - _between(_CLAMPED, draw[1])), 0.5 - size[2] / 2]
+    opposite = [0.5 + size[0] / 2, height + size[1] / 2, 0.5 + size[2] / 2]
+    clamp: dict[str, Any] = {
+        "lowest": [_rounded(low - _MARGIN * (axis != 1)) for axis, low in enumerate(corner)],
+        "highest": [_rounded(high + _MARGIN) for high in opposite],
+    }
+    time = _rounded(after * _between((0.1, 0.4), draw[2]))
+    away = [_rounded(lab.max_speed * draw[3] * time * n) for n in _direction(draw[4], draw[5])]
+    x = own.x0.double().cpu().numpy()
+    reached = np.stack([x, x + away])
+    if reached.min() < _MARGIN or reached.max() > 1 - _MARGIN:
+        return "outside"
+    still = [0.0, 0.0, 0.0]
+    if any(away):
+        clamp["keyframes"] = [[0.0, still, still], [time, away, still], [_rounded(2 * time), still, still]]
+    if draw[6] < 0.5:
+        clamp["release"] = _rounded(2 * time + after * draw[7] / 2)
+    if (x[:, 1] >= clamp["lowest"][1]).mean() < _MIN_CLAMPED:
+        return "empty"
+    settings = {"height": height, "center": [0.5, 0.5], **_REST, "clamps": [clamp]}
+    start = _moving(own, settings, motion.axes, np.zeros(6))
+    steps = _in_steps(model, 2 * after)
+    return Start({**settings, "steps": steps}, replace(model, clamps=(Clamp(**clamp),)), own, start, steps)
+
+
+STARTS: dict[str, Callable[..., Start | str]] = {
+    "launch": _launch,
+    "turned": partial(_launch, turn=True),
+    "press": _press,
+    "hang": _hang,
+}
+"""Kinds of starts: functions of the existing video, the time that it shows after the contact [s], limits, and a point
+of the unit cube (10,)."""
+
+
+def _moving(
+    body: Reconstruction, settings: Mapping[str, Any], axes: np.ndarray, std: np.ndarray
+) -> InitialMotion:
+    centre = (body.mass.double() @ body.x0.double() / body.mass.double().sum()).cpu().numpy()
+    return InitialMotion(np.array(settings["velocity"]), np.array(settings["spin"]), centre, axes, std)
+
+
+def _size(body: Reconstruction) -> np.ndarray:
+    """Lengths of the bounding box of the particles (3,) [m]."""
+    return np.ptp(body.x0.double().cpu().numpy(), axis=0)
+
+
+def _in_steps(model: MPM, duration: float) -> int:
+    return _STEPS * math.ceil(duration / model.dt / _STEPS)
+
+
+def _between(limits: tuple[float, float], share: float) -> float:
+    return limits[0] + (limits[1] - limits[0]) * share
 
 
 def _direction(a: float, b: float) -> np.ndarray:

@@ -16,7 +16,7 @@ from neuma_lib.config.next import NextConfig
 from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError, NonFiniteError
-from neuma_lib.fitting.candidate_experiments import as_cameras, draw_launches, second_cameras
+from neuma_lib.fitting.candidate_experiments import STARTS, as_cameras, draw_starts, second_cameras
 from neuma_lib.fitting.families import Family
 from neuma_lib.fitting.identified import FamilyFit
 from neuma_lib.fitting.next_experiment import (
@@ -35,13 +35,12 @@ from neuma_lib.mechanics.combinations import Values
 from neuma_lib.sim.batch import rollout_batch
 from neuma_lib.sim.model import MPM
 from neuma_lib.sim.state import Trajectory
-from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.observation import joint_frames
 from neuma_lib.splatting.viewpoints import video_views
 
 MIN_GAIN = 0.05
 """Relative decrease of what is ranked below which an experiment is useless."""
-_LENGTHS = ("height", "center", "velocity")  # settings with lengths [m] or [m/s]
+_LENGTHS = ("height", "center", "velocity", "size", "lowest", "highest")  # settings with lengths [m] or [m/s]
 _IDENTIFY = "Run `snakemake --cores 2 results/<scene>/identified.json` first"
 
 
@@ -50,12 +49,12 @@ class Option:
     """An experiment that could be done next.
 
     Attributes:
-        kind: launch or camera.
+        kind: one of `NextConfig.kinds`.
         settings: of its scene, or of the camera.
         forecast: its expected result.
         after: what is ranked, after the experiment (`Selection.goal`); smaller is better.
         prediction: expected standard deviation of the chosen motion [m], or None.
-        body, path, cameras: its motion with the identified constants, and what would film it.
+        experiment, path: what would be filmed, and its motion with the identified constants.
     """
 
     kind: str
@@ -63,9 +62,8 @@ class Option:
     forecast: Forecast
     after: float
     prediction: float | None
-    body: Reconstruction
+    experiment: Experiment
     path: Trajectory
-    cameras: Cameras
 
 
 @dataclass(frozen=True)
@@ -115,13 +113,9 @@ class Selection:
 
     def _option(self, option: Option, scale: float) -> dict[str, Any]:
         fit, settings = option.forecast.fit, self.settings
-        own = {
-            key: (np.array(value) / scale).tolist() if key in _LENGTHS and scale != 1.0 else value
-            for key, value in option.settings.items()
-        }
         return {
             "kind": option.kind,
-            "settings": own,
+            "settings": _in_room(option.settings, scale),
             "after": option.after / (scale if self.goal == "prediction" else 1.0),
             "expected": stds(fit, settings),
             "becomes_determined": {
@@ -135,6 +129,21 @@ class Selection:
             **({"prediction_std": option.prediction / scale} if option.prediction is not None else {}),
             "covariance": fit.covariance.tolist(),
         }
+
+
+def _in_room(settings: Mapping[str, Any], scale: float) -> dict[str, Any]:
+    """Settings of a scene, with lengths in metres of a room of which one has ``scale`` metres of the box."""
+    if scale == 1.0:
+        return dict(settings)
+    own: dict[str, Any] = {}
+    for key, value in settings.items():
+        if key in _LENGTHS:
+            own[key] = (np.array(value) / scale).tolist()
+        elif key == "keyframes":
+            own[key] = [[time, (np.array(centre) / scale).tolist(), turn] for time, centre, turn in value]
+        else:
+            own[key] = [_in_room(each, scale) for each in value] if key in ("colliders", "clamps") else value
+    return own
 
 
 def read_fit(record: Mapping[str, Any], settings: IdentifyConfig) -> FamilyFit:
@@ -227,7 +236,7 @@ def choose_next(
 
     now = Forecast(fit, np.zeros_like(fit.covariance), {})
     before, prediction = ranked(now)
-    candidates = _candidates(filmed[0], known, lab, reframe, seed)
+    candidates = _candidates(filmed[0], known, lab, reframe, seed, log)
     options, failed = [], 0
     for done, (kind, own, experiment, path) in enumerate(candidates):
         try:
@@ -238,8 +247,7 @@ def choose_next(
             failed += 1
         else:
             after, predicted = ranked(forecast)
-            cameras = experiment.video[-1].cameras
-            options.append(Option(kind, own, forecast, after, predicted, experiment.body, path, cameras))
+            options.append(Option(kind, own, forecast, after, predicted, experiment, path))
             log(f"{kind} {own}: {before:.4g} to {after:.4g}")
         if progress:
             progress(done + 1, len(candidates))
@@ -250,58 +258,71 @@ def choose_next(
 
 
 def _candidates(
-    first: Experiment, known: Knowledge, lab: NextConfig, reframe: bool, seed: int
+    first: Experiment,
+    known: Knowledge,
+    lab: NextConfig,
+    reframe: bool,
+    seed: int,
+    log: Callable[[str], None],
 ) -> list[tuple[str, dict[str, Any], Experiment | None, Trajectory | None]]:
-    """Kind, settings, experiment and motion of each candidate; no experiment where the motion diverges."""
+    """Kind, settings, experiment and motion of each candidate; no experiment where the motion diverges.
+
+    Kinds that are not possible are left out, unless there is no other.
+    """
     frames = joint_frames(first.video)
     cameras = first.video[0].cameras
     candidates: list[tuple[str, dict[str, Any], Experiment | None, Trajectory | None]] = []
     if "camera" in lab.kinds:
-        (path,) = _motions(known, first.model, [(first.body, first.motion, frames)])
+        (path,) = _motions(known, [(first.model, first.body, first.motion, frames)])
         points = path.x.flatten(0, 1).cpu().numpy() if path else np.zeros((1, 3))
         for place, camera in second_cameras(cameras[0], points, reframe)[: lab.candidates]:
             video = [*first.video, unfilmed(frames, camera)]
             candidates.append(("camera", dict(place), path and replace(first, video=video), path))
-    turned = [kind == "turned" for kind in lab.kinds if kind != "camera"]
+    kinds, refusals = [kind for kind in lab.kinds if kind != "camera"], list[InputError]()
     left = lab.candidates - len(candidates)
-    for k, turn in enumerate(turned):
-        count = (k + 1) * left // len(turned) - k * left // len(turned)
+    for k, kind in enumerate(kinds):
+        count = (k + 1) * left // len(kinds) - k * left // len(kinds)
         if count < 1:
             continue
-        own_seed = seed + int(turn)
-        launches = draw_launches(
-            first.model, first.body, first.motion, frames[-1], lab, count, own_seed, turn
-        )
+        own_seed = seed + list(STARTS).index(kind)
+        try:
+            starts = draw_starts(
+                first.model, first.body, first.motion, frames[-1], lab, count, own_seed, kind
+            )
+        except InputError as error:
+            refusals.append(error)
+            log(str(error))
+            continue
         spaced = [
-            tuple(round(k * launch.steps / (len(frames) - 1)) for k in range(len(frames)))
-            for launch in launches
+            tuple(round(k * start.steps / (len(frames) - 1)) for k in range(len(frames))) for start in starts
         ]
-        motions = [(t.body, t.motion, own) for t, own in zip(launches, spaced, strict=True)]
-        for launch, own, path in zip(launches, spaced, _motions(known, first.model, motions), strict=True):
+        motions = [(s.model, s.body, s.motion, own) for s, own in zip(starts, spaced, strict=True)]
+        for start, own, path in zip(starts, spaced, _motions(known, motions), strict=True):
             seen = cameras
             if reframe and path:
                 views = video_views(
                     path.x.flatten(0, 1).cpu().numpy(), len(cameras), cameras.width, cameras.height
                 )
                 seen = as_cameras(views, cameras)
-            experiment = Experiment(first.model, launch.motion, launch.body, [unfilmed(own, seen)])
-            candidates.append(("launch", launch.settings, experiment if path else None, path))
+            experiment = Experiment(start.model, start.motion, start.body, [unfilmed(own, seen)])
+            candidates.append((kind, start.settings, experiment if path else None, path))
+    if not candidates:
+        raise refusals[0]
     return candidates
 
 
 @torch.no_grad()
 def _motions(
     known: Knowledge,
-    model: MPM,
-    motions: Sequence[tuple[Reconstruction, InitialMotion, tuple[int, ...]]],
+    motions: Sequence[tuple[MPM, Reconstruction, InitialMotion, tuple[int, ...]]],
 ) -> list[Trajectory | None]:
-    """Motions with the identified constants, in the same launches where their frames end together."""
+    """Motions with the identified constants, together where they have the same model and frames."""
     paths: list[Trajectory | None] = [None] * len(motions)
-    law = analytic_law(known.fit.family.law_spec(known.fit.values), model.dt)
-    for frames in {frames for *_, frames in motions}:
-        own = [k for k, motion in enumerate(motions) if motion[2] == frames]
-        starts = [motions[k][1].of_body(motions[k][0]) for k in own]
-        laws = [law.to(start.x.device) for start in starts]
+    spec = known.fit.family.law_spec(known.fit.values)
+    for model, frames in {(model, frames) for model, *_, frames in motions}:
+        own = [k for k, motion in enumerate(motions) if (motion[0], motion[3]) == (model, frames)]
+        starts = [motions[k][2].of_body(motions[k][1]) for k in own]
+        laws = [analytic_law(spec, model.dt).to(start.x.device) for start in starts]
         batch = rollout_batch(model, laws, starts, steps=frames[-1], frames=frames, total=True)
         for k, path in zip(own, batch, strict=True):
             paths[k] = path

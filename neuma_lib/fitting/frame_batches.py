@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from neuma_lib.errors import InputError
-from neuma_lib.sim.model import MPM, contact_clearance
+from neuma_lib.sim.model import MPM, contact_clearance, model_of_each
 from neuma_lib.sim.state import State
 
 
@@ -40,23 +40,24 @@ def first_contact(model: MPM, x: Tensor, vol0: Tensor, steps: Sequence[int] = (0
     return int(touching.int().argmax()) if bool(touching.any()) else len(x)
 
 
-def check_contact(model: MPM, videos: Iterable[tuple[State, Sequence[int]]]) -> None:
-    """Check that a body touches a wall within a video, since its free flight does not depend on the material.
+def check_contact(model: MPM | Sequence[MPM], videos: Iterable[tuple[State, Sequence[int]]]) -> None:
+    """Check that a body touches a wall or is clamped within a video, since free flight is the same for all materials.
 
     The motion before contact is known in closed form: a parabola and, up to the small stretch by a spin, a rotation.
 
     Args:
+        model: simulator constants, of all videos or of each.
         videos: initial state of the body and steps of the frames of each video.
 
     Raises:
         InputError: no body touches a wall before the last frame of its video.
     """
-    ends = []
-    for start, frames in videos:
-        ends.append((start, last := frames[-1]))
-        if any(_touches(model, start, n) for n in (last, *frames)):
+    ends, videos = [], list(videos)
+    for own, (start, frames) in zip(model_of_each(model, len(videos)), videos, strict=True):
+        ends.append((own, start, last := frames[-1]))
+        if own.clamps or any(_touches(own, start, n) for n in (last, *frames)):
             return
-    start, last = max(ends, key=lambda end: end[1])
+    model, start, last = max(ends, key=lambda end: end[2])
     later = range(last, 20 * last + 1, max(1, last // 20))
     contact = next((n for n in later if _touches(model, start, n)), None)
     expected = "" if contact is None else f", expected at about {contact * model.dt:.2g} s,"

@@ -51,7 +51,7 @@ from neuma_lib.fitting.frame_batches import check_contact
 from neuma_lib.fitting.identified import FamilyFit, Identified
 from neuma_lib.fitting.video_residuals import VideoResiduals
 from neuma_lib.mechanics.combinations import Values
-from neuma_lib.sim.model import MPM
+from neuma_lib.sim.model import MPM, model_of_each
 from neuma_lib.splatting.observation import Observation, joint_frames, several
 
 _CONTENDERS = 3  # families that are compared on the finer grid
@@ -59,7 +59,7 @@ _OTHER_LIMITS = (-2, -1, 1, 2)  # powers of 4 of the limits of a flow that resta
 
 
 def identify(
-    model: MPM,
+    model: MPM | Sequence[MPM],
     motion: InitialMotion,
     body: Reconstruction,
     observation: Observation | Sequence[Observation],
@@ -74,7 +74,7 @@ def identify(
     """Identify the family and the constants of the material shown in a video.
 
     Args:
-        model: simulator constants.
+        model: simulator constants, or those of each video if colliders or clamps differ.
         motion: estimate of the initial motion from the frames before contact.
         body: reconstructed particles and Gaussians.
         observation: the video, or several of the same motion by cameras of different times, sizes or exposures, with
@@ -101,14 +101,18 @@ def identify(
         raise InputError(
             "identify.families", "it has no candidates", "Add at least one elasticity with E and nu"
         )
-    check_contact(model, ((one.of_body(each), joint_frames(several(video))) for one, each, video in given))
+    models = model_of_each(model, len(given))
+    check_contact(models, ((one.of_body(each), joint_frames(several(video))) for one, each, video in given))
     fits_friction = settings.contact_friction == "fitted"
-    if fits_friction and model.contact != "particles":
+    if fits_friction and any(each.contact != "particles" for each in models):
         raise InputError("identify.contact_friction", *FRICTION_NEEDS)
     families = [Family(name, law.plain(), fits_friction) for name, law in settings.families.items()]
     families.sort(key=lambda family: len(family.constants))  # simpler families provide starts of the others
     resampled = refined or [None] * len(given)
-    videos = [VideoResiduals(model, *one, settings, own) for one, own in zip(given, resampled, strict=True)]
+    videos = [
+        VideoResiduals(each, *one, settings, own)
+        for each, one, own in zip(models, given, resampled, strict=True)
+    ]
     for video in videos:
         video.hold_out(families[0], settings.held_out)
         video.weight = (videos[0].fitted_pixels / video.fitted_pixels) ** 0.5
@@ -190,7 +194,7 @@ def identify(
         [video.frames[: video.fitted] for video in videos],
         [video.frames[video.fitted :] for video in videos],
         sum(video.rollouts for video in videos),
-        model.grid,
+        models[0].grid,
         settings,
         material,
         [fit.family.name for fit in compared.values() if math.isfinite(fit.score)],

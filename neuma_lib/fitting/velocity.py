@@ -96,6 +96,24 @@ class VelocityEstimate:
     iterations: int
     ridge: float
 
+    @classmethod
+    def at_rest(cls, centre: np.ndarray, axes: np.ndarray) -> VelocityEstimate:
+        """The motion of a body that is held at the start, which is exact."""
+        zero = np.zeros(3)
+        exact = dict.fromkeys(
+            ("v0", "spin", "std", "std_camera", "spin_std", "spin_std_camera", "information"), zero
+        )
+        return cls(
+            **exact,
+            centre=centre,
+            axes=axes,
+            frames=(),
+            nuisance=np.zeros(5),
+            loss=0.0,
+            iterations=0,
+            ridge=0.0,
+        )
+
     def as_dict(self) -> dict:
         """Plain numbers and lists for JSON."""
         return {
@@ -140,6 +158,8 @@ def estimate_velocity(
 ) -> VelocityEstimate:
     """Estimate the initial velocity and spin of a body from the frames before its first contact.
 
+    A body that is clamped at the start is at rest.
+
     Args:
         model: simulator constants.
         law: the prior law, which affects only the stretch of a spinning body before contact.
@@ -157,11 +177,13 @@ def estimate_velocity(
     if len(frames) < 2:
         raise InputError("frames", f"{len(frames)} of the training view before contact must be at least 2")
     videos, law = tuple(video.to(precision) for video in videos), copy.deepcopy(law).to(precision)
+    axes = videos[0].cameras.viewmats[0, :3, :3].cpu().numpy()
+    if model.clamps:
+        return VelocityEstimate.at_rest((body.mass @ body.x0 / body.mass.sum()).cpu().numpy(), axes)
     if float(contact_clearance(model, body.x0, body.vol0)) <= 0:
         raise InputError(
             "frames", "the body touches a wall in the first frame", "Start the video before the contact"
         )
-    axes = videos[0].cameras.viewmats[0, :3, :3].cpu().numpy()
     ends = tuple(max(n + video.exposure[-1] for video in videos if n in video.frames) for n in frames)
     flight = _Flight(model, law, body, ends)
     minimise = partial(_minimise, axes=axes, settings=settings, progress=progress)

@@ -176,11 +176,13 @@ class VideoResiduals:
         return sum(images[:count].numel() for images, count in zip(self._observed, counts, strict=True))
 
     def hold_out(self, family: Family, share: float) -> None:
-        """Hold out the last share of the frames after the first contact, whose time is the same for any law."""
+        """Hold out the last share of the frames after the first contact, whose time is the same for any law, or of all
+        frames of a clamped body."""
         law = family.law_spec(family.values(family.unbounded(family.guess), self.model, self.density))
         (path,), _ = self._paths([Candidate(law, np.zeros(NUISANCES))], len(self.frames), self._coarse)
         vol0 = self._coarse.body.vol0
-        contact = 0 if path is None else first_contact(self.model, path.at(self.frames).x, vol0, self.frames)
+        free = path is not None and not self.model.clamps
+        contact = 0 if not free else first_contact(self.model, path.at(self.frames).x, vol0, self.frames)
         self.fitted = held_out_frames(len(self.frames), share, contact=contact)[0]
 
     def residuals(

@@ -82,7 +82,13 @@ class ProjectCase(Case):
         return f"identified+views={','.join(map(str, views))}.json"
 
     def each_video(self, choose: Callable[[Case], str]) -> str | list[str]:
-        paths = [choose(replace(self, scene=scene)) for scene in self.settings.video_scenes(self.scene)]
+        scenes = self.settings.video_scenes(self.scene)
+        own, *others = (self.settings.obstacles(scene) for scene in scenes)
+        if any(other != own for other in others):
+            problem = f"colliders or clamps differ, and {self.name} is trained in videos with the same"
+            remedy = "Use the identified constants, or train in the videos of scenes with the same obstacles"
+            raise InputError(f"scenes.{self.scene}.videos", problem, remedy)
+        paths = [choose(replace(self, scene=scene)) for scene in scenes]
         return paths if len(paths) > 1 else paths[0]
 
     def seeds(self) -> tuple[str, ...]:

@@ -25,7 +25,7 @@ SYSTEM = ("bin", "boot", "dev", "etc", "lib", "lib64", "proc", "sbin", "sys", "u
 """Folders at the root of the file system that are no place for results."""
 SAMPLED_IN_TRUTH = ("particles", "tracers", "second tracers")
 """What the seeds dataset.seed, dataset.seed + 1 and dataset.seed + 2 sample, see `neuma_lib.data.ground_truth`."""
-SHARED_BY_VIDEOS = ("law", "prior", "dt", "colliders", "clamps", "friction")
+SHARED_BY_VIDEOS = ("law", "prior", "dt", "friction")
 """Keys that the scenes of several videos have in common."""
 
 

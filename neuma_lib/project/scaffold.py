@@ -111,8 +111,8 @@ def new_scene(root: Path, name: str, settings: Config, mesh: str | Path | None =
 def next_scene(root: Path, name: str, settings: Config, folder: Path, rank: int = 1) -> Path:
     """Write config/<name>.yaml with an experiment that the page of the next experiment lists.
 
-    A launch becomes the scene <name>, whose video trains the same law as that of the existing scene. A second camera
-    changes the views of the existing scene.
+    A start becomes the scene <name>, in whose video the same law is identified as in that of the existing scene. A
+    second camera changes the views of the existing scene.
 
     Args:
         root: folder of the project.
@@ -130,7 +130,8 @@ def next_scene(root: Path, name: str, settings: Config, folder: Path, rank: int 
     candidates = read_json(folder / "next.json")["candidates"]
     if not 1 <= rank <= len(candidates):
         raise InputError("--rank", f"{rank} must be from 1 to {len(candidates)}")
-    scene, chosen = settings.scene(known), candidates[rank - 1]
+    # Copied, because YAML knows no subclasses of dict.
+    scene, chosen = settings.scene(known), json.loads(json.dumps(candidates[rank - 1]))
     if not scene.has_truth or scene.images.dynamic is not None:
         problem = "is not rendered, so that the experiment has to be done and filmed"
         raise InputError(known, problem, "Add its video to the capture, or as a scene to `videos`")
@@ -140,8 +141,15 @@ def next_scene(root: Path, name: str, settings: Config, folder: Path, rank: int 
         count = max(settings.dataset.dynamic.views, view + 1)
         content = {"identify": {"views": views}, "dataset": {"dynamic": {"views": count}}}
     else:
-        launch = {"like": known, **chosen["settings"], "frames": None}
-        content = {"scenes": {name: launch, known: {"videos": [*scene.videos, name]}}}
+        own = {
+            "like": known,
+            "frames": None,
+            **({"clamps": []} if scene.clamps else {}),
+            **chosen["settings"],
+        }
+        if "colliders" in own:
+            own["colliders"] = [*(each.arguments() for each in scene.colliders), *own["colliders"]]
+        content = {"scenes": {name: own, known: {"videos": [*scene.videos, name]}}}
     title = f"# Experiment {rank} of {folder.name}/next.md, on top of the settings of {known}.\n"
     return _written(
         root / "config" / f"{name}.yaml",

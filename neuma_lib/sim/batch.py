@@ -11,7 +11,7 @@ import torch
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.mechanics.law import Law
 from neuma_lib.mechanics.side_by_side import fusible, has_kernels, side_by_side
-from neuma_lib.sim.model import MPM, MaterialRegion
+from neuma_lib.sim.model import MPM, MaterialRegion, model_of_each
 from neuma_lib.sim.rollout import check_bodies, check_inside, checked_frames, fly_and_simulate
 from neuma_lib.sim.state import State, Trajectory
 from neuma_lib.threads import in_threads
@@ -63,14 +63,10 @@ def rollout_batch(
             f"{len(laws)} laws do not match initial states of {[len(state.x) for state in starts]} particles",
             "Give one state for all laws or one per law, with equal numbers of particles",
         )
-    models = [model] * len(laws) if isinstance(model, MPM) else list(model)
+    models = model_of_each(model, len(laws))
     model = models[0]
-    if len(models) != len(laws) or any(own.frictionless != model.frictionless for own in models):
-        raise InputError(
-            "model",
-            f"{len(models)} models for {len(laws)} laws must be equal up to friction",
-            "Give one for all",
-        )
+    if any(own.frictionless != model.frictionless for own in models):
+        raise InputError("model", "the models must be equal up to friction", "Give one for all")
     for state in {id(state): state for state in starts}.values():
         check_bodies(model, state)
         check_inside(model, state.x)

@@ -213,6 +213,14 @@ class MaterialRegion:
     stop: int
 
 
+def model_of_each(model: MPM | Sequence[MPM], count: int) -> list[MPM]:
+    """The models of ``count`` simulations, from one for all or one for each. Raises InputError."""
+    models = [model] * count if isinstance(model, MPM) else list(model)
+    if len(models) != count:
+        raise InputError("model", f"{len(models)} models for {count} simulations", "Give one for all")
+    return models
+
+
 def law_weights(law: Law, dtype: torch.dtype) -> tuple[Weights, Weights]:
     """Weights of the elasticity and plasticity of a law in the precision ``dtype``."""
     elastic, plastic = law.weights()

@@ -1,10 +1,16 @@
 """Page of the next experiment: sentences state what a record contains."""
 
+from dataclasses import replace
+
+import numpy as np
 import torch
 from PIL import Image
 
+from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.evaluation.next_page import describe, draw, explain, page
+from neuma_lib.fitting.next_experiment import Experiment, unfilmed
 from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.sim.colliders import Collider
 from neuma_lib.sim.rollout import rollout
 from tests.support.grounding_scene import MODEL, TRUTH, ball, camera
 
@@ -48,10 +54,32 @@ def test_sentences_state_the_settings_and_the_gain():
     assert "motion from 8 mm to 2 mm" in explain({**RECORD, "prediction_std": 8e-3}, predicted)
 
 
+def test_a_press_and_a_hang_are_described():
+    still = [0.0, 0.0, 0.0]
+    poses = [[0.1, [0.5, 0.5, 0.5], still], [0.3, [0.5, 0.3, 0.5], still], [0.5, [0.5, 0.5, 0.5], still]]
+    press = {"kind": "press", "settings": {"height": 0.15, "colliders": [{"keyframes": poses}]}}
+    assert "height of 0.15 m and press it" in describe(
+        press
+    ) and "0.20 m and up again with 1.0 m/s" in describe(press)
+    clamp = {
+        "lowest": [0.3, 0.5, 0.3],
+        "keyframes": [[0, still, still], [0.2, [0, 0.3, 0.4], still], [0.4, still, still]],
+    }
+    hang = {"kind": "hang", "settings": {"height": 0.4, "clamps": [clamp]}}
+    assert "clamped above 0.50 m, move the clamp by 0.50 m (+0.30 m upwards) in 0.20 s and back" in describe(
+        hang
+    )
+    assert "let it go" not in describe(hang)
+    clamp["release"] = 0.35
+    assert describe(hang).endswith("and let it go at 0.35 s")
+
+
 def test_the_page_lists_every_candidate():
     text = page(RECORD, "next.png", "results/Duck")
     assert "![motions of the best candidates](next.png)" in text and "--from results/Duck" in text
-    assert "| 1 | launch it" in text and "| 2 | film the first launch" in text and "excluded" in text
+    assert "| 1 | launch it" in text and "| 2 | film the first launch" in text
+    assert "| 6 % | 9 % | K | excluded |" in text and "| 7 % | 21 % |  | 0.3 |" in text
+    assert "\n1. Launch it" in text and "\n2. Film the first launch" in text
     assert "now 20 %" in text and "No candidate" not in text
     assert "No candidate" in page({**RECORD, "useful": False}, "next.png", "results/Duck")
 
@@ -59,11 +87,17 @@ def test_the_page_lists_every_candidate():
 def test_the_picture_has_a_row_for_each_motion(tmp_path):
     """The body is in the frames: the picture of a falling ball has more than the colours of frames and letters."""
     body, frames = ball(0.3), tuple(range(0, 61, 6))
+    platen = Collider("box", (0.15, 0.02, 0.15), (0.5, 0.5, 0.5))
+    motion = InitialMotion(
+        np.array([0, -1.0, 0]), np.zeros(3), np.array([0.5, 0.3, 0.5]), np.eye(3), np.zeros(6)
+    )
     with torch.no_grad():
         path = rollout(MODEL, analytic_law(TRUTH, MODEL.dt), body.state((0, -1, 0)), steps=60, frames=frames)
     heights = []
-    for rows in (1, 2):
-        draw(tmp_path / "next.png", [(body, path, camera())] * rows, MODEL.dt)
+    models = (MODEL, replace(MODEL, colliders=(platen,)))
+    for rows, model in enumerate(models, 1):
+        own = Experiment(model, motion, body, [unfilmed(frames, camera())])
+        draw(tmp_path / "next.png", [(own, path)] * rows)
         with Image.open(tmp_path / "next.png") as image:
             heights.append(image.height)
             coloured = sum(

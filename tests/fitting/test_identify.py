@@ -14,11 +14,12 @@ from neuma_lib.config.laws import LawConfig
 from neuma_lib.config.training import TrainingConfig
 from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.errors import NonFiniteError
+from neuma_lib.fitting import identify as identification
 from neuma_lib.fitting.families import MAX_COURANT, Family
 from neuma_lib.fitting.family_run import FamilyRun
 from neuma_lib.fitting.frame_batches import check_contact, first_contact
 from neuma_lib.fitting.identified import FamilyFit, Identified
-from neuma_lib.fitting.identify import _better_later, _prune, _select, identify
+from neuma_lib.fitting.identify import _better_later, _first_fit, _prune, _select, identify
 from neuma_lib.fitting.least_squares import (
     BLOCKS,
     Linearisation,
@@ -37,7 +38,8 @@ from neuma_lib.mechanics.combinations import named_combinations
 from neuma_lib.methods.base import Problem
 from neuma_lib.methods.spring_gaus.method import SpringGaus
 from neuma_lib.methods.training import Training
-from neuma_lib.sim.colliders import contact_radius
+from neuma_lib.sim.clamps import Clamp
+from neuma_lib.sim.colliders import Collider, contact_radius
 from neuma_lib.sim.rigid_flight import rigid_flight
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
@@ -187,6 +189,29 @@ def test_two_videos_have_the_constants_in_common_and_a_motion_each():
     written = both.as_dict()
     assert written["start"]["v0"] == list(V0) and len(written["further_videos"]) == 1
     assert "further_videos" not in alone.as_dict()
+
+
+def test_videos_have_their_own_colliders_and_clamps():
+    """A press and a hang: the true stiffness, and images that the obstacles of the other video do not explain."""
+    families, truth = {"hencky": ELASTIC}, law("hencky", E=3e4, nu=0.4)
+    still, poses = (0.0, 0.0, 0.0), ((0.0, 0.5), (0.12, 0.3), (0.24, 0.5))
+    platen = Collider("box", (0.2, 0.02, 0.2), keyframes=tuple((t, (0.5, y, 0.5), still) for t, y in poses))
+    clamp = Clamp((0.3, 0.32, 0.3), (0.7, 0.5, 0.7), release=0.15)
+    models = [replace(MODEL, colliders=(platen,)), replace(MODEL, clamps=(clamp,))]
+    videos = []
+    for model in models:
+        body = ball()
+        seen = observe(body, still, FRAMES, truth, model)
+        seen = Observation(seen.frames, seen.images + pixel_noise(seen.images), seen.cameras)
+        videos.append((known(body, v0=still), body, seen))
+    chosen = settings(families, covariance_from="elastic", pyramid=(8, 32))
+    own, swapped = (
+        identify(each, *videos[0], chosen, other_videos=videos[1:]).best for each in (models, models[::-1])
+    )
+    assert own.values["E"] == pytest.approx(3e4, rel=0.03)
+    assert swapped.loss > 10 * own.loss
+    with refused("model"):
+        identify([*models, MODEL], *videos[0], chosen, other_videos=videos[1:])
 
 
 def test_videos_count_alike_however_long():
@@ -645,6 +670,34 @@ def test_less_flow_is_towards_the_elastic_limit_and_within_bounds():
     ]
     assert 30 < angles[0] < angles[1] < 90
     assert Family("elastic", ELASTIC).with_other_limits(values, (1, 2)) == []
+
+
+def test_a_plastic_family_starts_from_weak_flow_and_from_fits_of_others(monkeypatch):
+    """From its guesses and weaker limits of the last one, and from an elastic fit, then nearer to its elastic limit."""
+    starts = []
+
+    class Run(SimpleNamespace):
+        alive = True
+
+        def resembles(self, other):
+            return False
+
+        def begin(self, given, below):
+            starts.append([(values["E"], values["yield_stress"]) for values in given])
+
+    fit = SimpleNamespace(cost=1.0)
+    monkeypatch.setattr(
+        identification, "FamilyRun", lambda family, *given: Run(family=family, fit=fit, loss=1.0, rollouts=1)
+    )
+    elastic = Run(family=Family("elastic", ELASTIC), fit=fit, values={"E": 5e4, "nu": 0.2})
+    family = Family("plastic", law("hencky", "von_mises", E=3e4, nu=0.3, yield_stress=4e3))
+    published = {"E": 6e4, "nu": 0.3, "yield_stress": 8e3}
+    best = _first_fit(family, [], [elastic], published, settings({"elastic": ELASTIC}))
+    (first, second), guess = starts, (3e4, 4e3)
+    assert first == [pytest.approx(each) for each in (guess, (6e4, 8e3), (6e4, 2e3), (6e4, 500.0))]
+    limit = second[0][1]  # the elastic fit is the best one, and that of a family that this one contains
+    assert second == [pytest.approx((5e4, factor * limit)) for factor in (1, 1, 4, 16)]
+    assert best.rollouts == 2
 
 
 def test_a_published_law_gives_what_the_family_has():

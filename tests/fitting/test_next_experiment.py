@@ -12,7 +12,7 @@ from neuma_lib.config.identify import IdentifyConfig
 from neuma_lib.config.laws import LawConfig
 from neuma_lib.config.next import NextConfig
 from neuma_lib.coupling.initial_motion import InitialMotion
-from neuma_lib.fitting.candidate_experiments import draw_launches, flight, placed, second_cameras
+from neuma_lib.fitting.candidate_experiments import STARTS, draw_starts, flight, placed, second_cameras
 from neuma_lib.fitting.choose_next import choose_next, read_fit, read_rivals
 from neuma_lib.fitting.families import Family
 from neuma_lib.fitting.family_run import FamilyRun
@@ -34,6 +34,7 @@ from neuma_lib.fitting.next_experiment import (
 )
 from neuma_lib.fitting.video_residuals import NUISANCES, Candidate
 from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.sim.clamps import clamped_particles
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.splatting.observation import Observation
 from tests.support.errors import refused
@@ -187,6 +188,13 @@ def test_the_combination_that_becomes_determined_is_named():
     (name, (before, after)), *others = newly_determined(fitted(0.5 * np.eye(2)), mixed, chosen).items()
     assert not others and "^" in name and after < 0.1 <= before
     assert slope.shape == (2, 2)
+    # The error that all images share remains, and can be too large.
+    pairs = [
+        newly_determined(fitted(0.5 * np.eye(2)), mixed, chosen.model_copy(update={"model_std": std}))
+        for std in (0.0, 0.06, 0.1)
+    ]
+    (exact,), (wider,) = (pair.values() for pair in pairs[:2])
+    assert wider == pytest.approx([math.hypot(std, 0.06) for std in exact]) and pairs[2] == {}
 
 
 def test_predicted_motion_is_as_uncertain_as_that_of_drawn_constants(known):
@@ -210,14 +218,14 @@ def test_predicted_motion_is_as_uncertain_as_that_of_drawn_constants(known):
     assert 1e-4 < std < 0.1
 
 
-def launches(lab: NextConfig, count=12, **options):
+def starts(lab: NextConfig, count=12, kind="launch"):
     body = ball(0.27)
-    return draw_launches(MODEL, body, motion(body=body), FRAMES[-1], lab, count, 1, **options)
+    return draw_starts(MODEL, body, motion(body=body), FRAMES[-1], lab, count, 1, kind)
 
 
 def test_launches_keep_the_limits_of_the_lab_and_reach_the_floor_first():
     lab = NextConfig(max_height=0.6, max_speed=2.0, max_spin=0.0)
-    drawn = launches(lab)
+    drawn = starts(lab)
     assert len(drawn) == 12 and len({launch.settings["height"] for launch in drawn}) > 6
     for launch in drawn:
         own = launch.settings
@@ -231,7 +239,7 @@ def test_launches_keep_the_limits_of_the_lab_and_reach_the_floor_first():
         assert box == pytest.approx([own["center"][0], own["height"], own["center"][1]])
         contact, reason = flight(MODEL, launch.body, launch.motion, launch.steps * MODEL.dt)
         assert reason is None and 0.15 * launch.steps * MODEL.dt < contact < 0.65 * launch.steps * MODEL.dt
-    assert max(math.dist(t.settings["spin"], (0, 0, 0)) for t in launches(NextConfig(max_spin=5.0))) > 2
+    assert max(math.dist(t.settings["spin"], (0, 0, 0)) for t in starts(NextConfig(max_spin=5.0))) > 2
 
 
 def test_the_flight_is_that_of_the_simulation():
@@ -263,7 +271,7 @@ def test_a_turned_body_is_the_same_body():
     assert torch.allclose(distances(own), distances(body), atol=1e-9)
     box = (own.x0.amin(0) + own.x0.amax(0)) / 2
     assert box.tolist() == pytest.approx([0.4, 0.5, 0.6])
-    turned = launches(NextConfig(), count=4, turn=True)
+    turned = starts(NextConfig(), 4, "turned")
     assert all(math.dist(launch.settings["rotation"], (0, 0, 0)) > 0.1 for launch in turned)
 
 
@@ -278,9 +286,65 @@ def test_second_cameras_see_the_motion_from_elsewhere():
         assert float(own.viewmats[0, 2, :3] @ first.viewmats[0, 2, :3]) < 0.99
 
 
-def test_no_launch_inside_the_box_is_refused():
-    with refused("next"):
-        launches(NextConfig(max_height=0.1))
+@pytest.mark.parametrize("kind", STARTS)
+def test_no_start_inside_the_box_is_refused(kind):
+    with refused("next", problem=f"{kind} is possible"):
+        starts(NextConfig(max_height=0.1), kind=kind)
+
+
+def test_kinds_that_are_not_possible_are_left_out_unless_there_is_no_other(alone):
+    """A lab in which nothing moves can film the body from elsewhere, but not press it."""
+    lab, lines = NextConfig(candidates=7, max_speed=0, kinds=("press", "camera")), []
+    fit = replace(alone.best, covariance=400 * alone.best.covariance)
+    choice = choose_next(fit, [experiment()], settings(), lab, log=lines.append)
+    assert {option.kind for option in choice.options} == {"camera"} and "press" in "".join(lines)
+    with refused("next", problem="press"):
+        lab = lab.model_copy(update={"kinds": ("press",)})
+        choose_next(fit, [experiment()], settings(), lab)
+
+
+def test_a_platen_presses_the_body_on_the_floor_and_lets_go():
+    """The body lands before the platen touches it, is compressed to where the platen stops, and is free at the end."""
+    for start in starts(NextConfig(max_speed=1.5), 4, "press"):
+        (platen,) = start.model.colliders
+        (_, high, _), (moment, low, _), (end, last, _) = platen.keyframes
+        assert last == high and (high[1] - low[1]) / (moment - platen.keyframes[0][0]) <= 1.51
+        frames = (0, round(moment / MODEL.dt), start.steps)
+        law = analytic_law(TRUTH, MODEL.dt)
+        with torch.no_grad():
+            path = rollout(
+                start.model, law, start.motion.of_body(start.body), steps=start.steps, frames=frames
+            )
+        top = path.x[..., 1].amax(1)
+        bottom = low[1] - platen.size[1]
+        assert start.steps * MODEL.dt >= end - 0.03 and top[0] < high[1] - platen.size[1]
+        # Surfaces are resolved to half a cell.
+        assert abs(top[1] - bottom) < MODEL.dx / 2 and top[1] < top[0] - 0.1 * 2 * 0.13
+        assert platen.surface(path.x[-1], start.steps * MODEL.dt)[0].min() > 0
+
+
+def test_a_clamp_holds_the_body_until_it_lets_go():
+    """The clamped particles follow the clamp, and those that are let go fall with g."""
+    drawn = starts(NextConfig(max_speed=1.5), 8, "hang")
+    assert 0 < sum("release" in s.settings["clamps"][0] for s in drawn) < 8
+    for start in drawn:
+        (clamp,) = start.model.clamps
+        held = clamped_particles([clamp], start.body.x0) == 0
+        assert 0.01 < held.double().mean() < 0.5 and not start.motion.std.any()
+        turn = round(clamp.keyframes[1][0] / MODEL.dt)
+        last = start.steps if math.isinf(clamp.release) else min(start.steps, round(clamp.release / MODEL.dt))
+        law = analytic_law(TRUTH, MODEL.dt)
+        frames = (0, turn, last, start.steps) if last < start.steps else (0, turn, last)
+        with torch.no_grad():
+            path = rollout(
+                start.model, law, start.motion.of_body(start.body), steps=start.steps, frames=frames
+            )
+        _, away = clamp.pose(turn * MODEL.dt)
+        assert path.x[1, held] == pytest.approx(path.x[0, held] + away, abs=1e-9)
+        if last == start.steps:
+            assert path.x[-1, held] == pytest.approx(start.body.x0[held], abs=1e-6)
+        elif start.steps - last > 20:
+            assert path.x[3, held, 1].mean() < path.x[2, held, 1].mean()
 
 
 def test_known_constants_are_refused_unless_families_tie():
@@ -297,17 +361,13 @@ def test_known_constants_are_refused_unless_families_tie():
 
 
 def test_candidates_are_ranked_and_written(alone):
-    """Launches and cameras together; the record reads back, and progress reaches the end."""
+    """All kinds together; the record reads back, and progress reaches the end."""
     chosen, calls = settings(), []
     fit = replace(alone.best, covariance=400 * alone.best.covariance)
     lab = NextConfig(candidates=9)
     choice = choose_next(fit, [experiment()], chosen, lab, progress=lambda *each: calls.append(each))
     assert calls[-1] == (9, 9) and len(choice.options) + choice.failed == 9
-    assert {option.kind for option in choice.options} == {"launch", "camera"}
-    assert {"rotation" in option.settings for option in choice.options if option.kind == "launch"} == {
-        False,
-        True,
-    }
+    assert {option.kind for option in choice.options} == {*lab.kinds}
     after = [option.after for option in choice.options]
     assert after == sorted(after) and after[0] < choice.before and choice.useful
     written = choice.as_dict()
@@ -317,6 +377,17 @@ def test_candidates_are_ranked_and_written(alone):
             assert box["settings"]["velocity"] == [2 * v for v in room["settings"]["velocity"]]
             assert box["settings"]["height"] == 2 * room["settings"]["height"]
             assert box["settings"]["spin"] == room["settings"]["spin"]
+        if box["kind"] == "press":
+            (platen,), (own,) = box["settings"]["colliders"], room["settings"]["colliders"]
+            assert platen["size"] == [2 * length for length in own["size"]]
+            assert platen["keyframes"][1][:2] == [
+                own["keyframes"][1][0],
+                [2 * y for y in own["keyframes"][1][1]],
+            ]
+        if box["kind"] == "hang":
+            assert box["settings"]["clamps"][0]["lowest"] == [
+                2 * y for y in room["settings"]["clamps"][0]["lowest"]
+            ]
 
 
 def test_a_record_is_read_and_a_missing_family_refused(alone):

@@ -1,18 +1,22 @@
 """Initial velocity from images: exact where the model is, honest about depth."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from neuma_lib.config.velocity import VelocityConfig
+from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.coupling.particle_gs import ParticleGS
 from neuma_lib.fitting.velocity import UNKNOWNS, _Flight, estimate_velocity
 from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.sim.clamps import Clamp
 from neuma_lib.sim.model import contact_clearance
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.splatting.observation import Observation
 from tests.support.errors import refused
-from tests.support.grounding_scene import MODEL, PRIOR, RADIUS, ball, observe
+from tests.support.grounding_scene import MODEL, PRIOR, RADIUS, TRUTH, ball, observe
 
 FRAMES = (0, 4, 8, 12, 16, 20, 60)
 
@@ -175,6 +179,16 @@ def test_bytes_are_their_colours_and_few_frames_at_a_time_give_the_sums_of_all(m
     again = estimate(body, Observation(clean.frames, decoded.colours(), clean.cameras), ridge=0.0)
     for name in ("v0", "std", "information", "loss"):
         np.testing.assert_allclose(getattr(again, name), getattr(motion, name), rtol=1e-6)
+
+
+def test_a_clamped_body_is_at_rest():
+    body, frames = ball(), tuple(range(0, 33, 4))
+    held = replace(MODEL, clamps=(Clamp((0, 0.3, 0), (1, 1, 1)),))
+    seen = observe(body, (0.0, 0.0, 0.0), frames, model=held)
+    law = analytic_law(TRUTH, MODEL.dt)
+    motion = InitialMotion.of(estimate_velocity(held, law, body, seen, VelocityConfig()).as_dict())
+    assert not np.concatenate([motion.velocity, motion.spin, motion.std]).any()
+    assert motion.centre == pytest.approx((body.mass @ body.x0 / body.mass.sum()).numpy())
 
 
 def test_a_body_that_starts_in_contact_is_an_input_error():

@@ -1,13 +1,16 @@
-"""Recording updates numbers of pages from tables and figures, and nothing else."""
+"""Recording updates numbers of pages from tables and figures, and nothing else. The pages agree with the records."""
 
 from __future__ import annotations
 
+import re
+import shutil
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from docs import record
+from docs import record, recorded
 from neuma_lib.io.files import write_json
 from neuma_lib.paper.image_grid import ImageGrid, save_image_grid
 from neuma_lib.paper.published import PAPER
@@ -16,7 +19,14 @@ from neuma_lib.paper.tables import chamfer_table
 from tests.support.random_results import METHODS, result
 from tests.support.table_results import run
 
+ROOT = Path(__file__).resolve().parents[2]
 PAGE = "# Title\n\nBefore.\n\n<!-- {0} -->\nold\n<!-- /{0} -->\n\nAfter.\n"
+SUMMARY = f"{PAGE.format('summary')}{PAGE.format('verdicts_in_short')}"
+RUN = re.compile(
+    r"\b[0-9a-f]{7,8}\b|`(snakemake|python|pytest|make|neuma)\b|tests/|^    (snakemake|python|neuma) ",
+    re.MULTILINE,
+)
+"""A commit, a command or a test."""
 
 
 @pytest.fixture
@@ -54,41 +64,48 @@ def project(tmp_path):
         {"weights": [0, 0.5, 1, 2], "scenes": {"A": {"heights": heights}}},
     )
     save_image_grid(figures / "lora_alphav.h5", grid)
-    (tmp_path / "docs").mkdir()
+    out = tmp_path / "docs/results"
+    out.mkdir(parents=True)
     (tmp_path / "README.md").write_text(PAGE.format("table1"))
-    (tmp_path / "docs/claims.md").write_text(PAGE.format("verdicts"))
-    (tmp_path / "docs/figures.md").write_text(PAGE.format("figures"))
+    (out / "README.md").write_text(SUMMARY)
+    (out / "claims.md").write_text(PAGE.format("verdicts"))
+    (out / "figures.md").write_text(PAGE.format("figures"))
+    shutil.copytree(ROOT / "config", tmp_path / "config")
     return tmp_path
 
 
-def recorded(project, monkeypatch, *options) -> tuple[str, str]:
+def record_all(project, monkeypatch, *options) -> tuple[str, str]:
     """The README, and the pages of claims and figures, after a recording."""
-    where = ["--results", "results", "--out", "docs", "--readme", "README.md", "--machine", "a machine"]
     monkeypatch.chdir(project)
-    monkeypatch.setattr(sys, "argv", ["record", *where, "--commit", "abc", *options])
+    monkeypatch.setattr(sys, "argv", ["record", "--machine", "a machine", "--commit", "abc", *options])
     record.main()
     return (project / "README.md").read_text(), "".join(
-        (project / "docs" / page).read_text() for page in ("claims.md", "figures.md")
+        (project / "docs/results" / page).read_text() for page in ("claims.md", "figures.md")
     )
 
 
 def test_pages_are_updated_from_tables_and_figures(project, monkeypatch):
-    readme, page = recorded(project, monkeypatch)
+    readme, page = record_all(project, monkeypatch)
     assert readme.startswith("# Title\n\nBefore.\n") and readme.endswith("<!-- /table1 -->\n\nAfter.\n")
-    assert "\nold\n" not in readme and "commit abc: [all columns" in readme and "*paper*" not in readme
-    assert "| NeuMA | 6.0 | 6.0 | 6.0 | 6.0 | 6.0 | 6.0 | 6.0 ± 1.0 |" in readme and "Median" not in readme
+    assert (
+        "\nold\n" not in readme and "[six scenes](docs/results/table1.md): commit abc, 36³ cells." in readme
+    )
+    assert "| NeuMA | 6.0 | 6.0 | 6.0 | 6.0 | 6.0 | 6.0 | 6.0 ± 1.0 |  |" in readme
+    assert "*paper*" not in readme and "Median" not in readme
     expected = (
         "| [table1](table1.md) | NeuMA is closer than its prior | **holds** | 6.0 ± 1.0 (NeuMA) against 51.0 ± 1.0"
         " (NCLaw), lower in 6 of 6 | 1.31 against 12.18 |\n\nNot recorded: table2"
     )
     assert expected in page, "other claims are about methods that were not run"
-    assert "Made by `snakemake tables figures` and `python" in (project / "docs/table1.md").read_text()
+    assert (
+        "Made by `snakemake tables figures` and `python" in (project / "docs/results/table1.md").read_text()
+    )
     assert "| NeuMA | 0.5 | 0.5 | 0.5 | 0.5 |" in page and "Training saw the views of B." in page
     assert "| A | elastic | 2 | 0.5 | 6.8 % | 1.1 % |" in page
     assert "| Method | A |\n|---|---:|\n| Constants | 75 % |" in page
     # Heights part in the last frame only, and there 0.6 is no step from 0.5 to 0.4.
     assert "0 of 1 (A)" in page
-    assert recorded(project, monkeypatch) == (readme, page)
+    assert record_all(project, monkeypatch) == (readme, page)
 
 
 def test_random_scenes_and_table1_convergeds_have_their_verdicts(project, monkeypatch):
@@ -106,7 +123,7 @@ def test_random_scenes_and_table1_convergeds_have_their_verdicts(project, monkey
     ):
         (project / f"results/{name}.md").write_text(text)
         (project / f"results/{name}.csv").write_text(values)
-    _, page = recorded(project, monkeypatch)
+    readme, page = record_all(project, monkeypatch)
     assert (
         "| [table1_converged](table1_converged.md) | with converged truths, NeuMA is closer than its prior | **holds** "
         "| 6.0 ± 1.0"
@@ -117,42 +134,123 @@ def test_random_scenes_and_table1_convergeds_have_their_verdicts(project, monkey
         " 11 of 12, errors 0.25 to 1.12 times as large | not compared there |"
     ) in page
     assert page.count("| [random](random.md) |") == 4
+    averages = "| NeuMA | 6.0 | 6.0 | 6.0 | 6.0 | 6.0 | 6.0 | 6.0 ± 1.0 | 6.0 ± 1.0 |"
+    assert averages in readme and "| True law |  |  |  |  |  |  |  | 9.0 ± 1.0 |" in readme
+    summary = (project / "docs/results/README.md").read_text()
+    assert "|  | prior | NeuMA | true law | commit, grid |\n" in summary, (
+        "methods without a row have no column"
+    )
+    assert "| [six scenes](table1.md) | 51.0 ± 1.0 | 6.0 ± 1.0 |  | abc, 36³ cells |" in summary
+    assert "converged truths](table1_converged.md) | 51.0 ± 1.0 | 6.0 ± 1.0 | 9.0 ± 1.0 | abc," in summary
+    assert "| [random scenes, seed 7, median](random.md) | 8.0 | 2.0 |" in summary
+    assert "- **holds**, 1 of 1: NeuMA is closer than its prior ([table1](table1.md))" in summary
     closer = page[page.index("\n\n[table1_converged](table1_converged.md): The true law") :]
     assert "than it: NeuMA in 6 of 6 columns (there by 3.0 of 9.0 mm on average)" in closer
-    assert "Made by `snakemake random` and" in (project / "docs/random.md").read_text()
+    assert "Made by `snakemake random` and" in (project / "docs/results/random.md").read_text()
 
 
 def test_settings_of_the_run_are_named(project, monkeypatch):
-    recorded(project, monkeypatch, "--configfile", "config/studies/three_chains.yaml")
-    table = (project / "docs/table1.md").read_text()
+    record_all(project, monkeypatch, "--configfile", "config/studies/three_chains.yaml")
+    table = (project / "docs/results/table1.md").read_text()
     assert "default settings (`config/config.yaml`) with `config/studies/three_chains.yaml`. Made by" in table
     assert "`snakemake --configfile config/studies/three_chains.yaml -- tables figures` and" in table
 
 
 def test_tables_that_are_not_recorded_are_named(project, monkeypatch):
-    _, page = recorded(project, monkeypatch)
+    _, page = record_all(project, monkeypatch)
     missing = page[page.index("Not recorded: ") :].partition(".\n")[0]
     assert (
         "table1_converged (`snakemake results/table1_converged.csv`), random (`snakemake random`)" in missing
     )
     assert "table1 (" not in missing and "table1_converged](" not in page and "random](" not in page
-    whole = dict.fromkeys(record.MADE_BY, f"{record.VERDICT_HEAD} here |\n|---|---|---|\n")
-    assert "ecorded" not in record.verdicts(whole)
-    assert "older version, without verdicts: table2." in record.verdicts(whole | {"table2": "- Holds: ..."})
+    tables = recorded.Tables(project / "docs/results")
+    whole = dict.fromkeys(recorded.MADE_BY, f"{recorded.VERDICT_HEAD} here |\n|---|---|---|\n")
+    tables.markdown = whole
+    assert "ecorded" not in recorded.verdicts(tables)
+    tables.markdown = whole | {"table2": "- Holds: ..."}
+    assert "older version, without verdicts: table2." in recorded.verdicts(tables)
 
 
 def test_a_page_without_a_marker_is_refused(project, monkeypatch):
     (project / "README.md").write_text("nothing\n")
     with pytest.raises(SystemExit, match="0 places <!-- table1 -->"):
-        recorded(project, monkeypatch)
+        record_all(project, monkeypatch)
 
 
-def test_pages_of_the_project_have_their_markers():
-    pages = {
-        "README.md": "table1",
-        "docs/results/claims.md": "verdicts",
-        "docs/results/figures.md": "figures",
-    }
-    for page, name in pages.items():
-        text = (record.Path(__file__).parents[2] / page).read_text()
-        assert record.filled(record.filled(text, name, "a"), name, "b").count("\nb\n") == 1
+def test_a_number_in_a_sentence_is_that_of_its_table(project, monkeypatch):
+    page = project / "docs/page.md"
+    page.write_text(
+        "It is <!-- table1 neuma Average -->9<!-- / --> mm, <!-- table1 neuma ClayCat tracer_rmse_last_mm -->9 ±\n"
+        "1<!-- / --> at the end.\n\n<!-- table table1 tracer_rmse_mm -->\nold\n<!-- /table -->\n"
+    )
+    record_all(project, monkeypatch)
+    text = page.read_text()
+    assert text.startswith(
+        "It is <!-- table1 neuma Average -->6.0 ± 1.0<!-- / --> mm, <!-- table1 neuma ClayCat"
+    )
+    assert "tracer_rmse_last_mm -->18.0 ± 3.0<!-- / --> at the end" in text
+    assert "| NCLaw | 51.0 ± 1.0 | 51.0 ± 1.0 |" in text and "old" not in text
+    assert recorded.pages(project) == {}
+
+
+@pytest.mark.parametrize(
+    ("place", "problem"),
+    [
+        ("<!-- table9 neuma Average -->1<!-- / -->", r"docs/results has no docs/results/table9.csv"),
+        ("<!-- table1 neuma Average chamfer9 -->1<!-- / -->", r"no \('chamfer9', 'neuma'\)"),
+        ("<!-- table1 neuma Elsewhere -->1<!-- / -->", "no Elsewhere"),
+        ("<!-- table1 neuma -->1<!-- / -->", "needs <!-- TABLE METHOD COLUMN -->"),
+    ],
+)
+def test_a_place_without_a_record_is_refused(project, monkeypatch, place, problem):
+    (project / "docs/page.md").write_text(place)
+    with pytest.raises(SystemExit, match=problem):
+        record_all(project, monkeypatch)
+
+
+def test_rows_of_another_record_are_not_compared(project, monkeypatch):
+    """The true law of the six scenes has another table, which may be older."""
+    columns = {column: column for column in PAPER["yardstick"].columns}
+    table = chamfer_table(
+        {"true_law": {c: [run(4.0)] for c in columns}}, {"true_law": "True law"}, columns, PAPER["yardstick"]
+    )
+    (project / "results/yardstick.md").write_text(table.markdown())
+    (project / "results/yardstick.csv").write_text(table.csv())
+    readme, _ = record_all(project, monkeypatch)
+    assert "| True law | 4.0 | 4.0 | 4.0 | 4.0 | 4.0 | 4.0 | 4.0 |  |" in readme
+    assert "| 6.0 ± 1.0 | 4.0 | abc," in (project / "docs/results/README.md").read_text()
+    readme, _ = record_all(project, monkeypatch, "--tables", "table1", "--commit", "def")
+    assert "True law" not in readme and "commit def" in readme
+    assert "true law" not in (project / "docs/results/README.md").read_text()
+
+
+def test_diverged_runs_are_marked(tmp_path):
+    (tmp_path / "t.csv").write_text(
+        "quantity,method,title,A,B,Average,Median,wins,diverged\nx,m,M,1,2,1.5,1.5,0,B\nx,n,N,–,nan,0.01,1,0,\n"
+    )
+    tables = recorded.Tables(tmp_path)
+    assert [tables.cell("t", "m", column) for column in ("A", "B", "Average")] == ["1.0", "2.0†", "1.5†"]
+    assert [tables.cell("t", "n", column) for column in ("A", "B", "Average")] == ["–", "–", "< 0.1"]
+
+
+def test_pages_of_the_project_agree_with_the_records():
+    changed = [str(page.relative_to(ROOT)) for page in recorded.pages(ROOT)]
+    assert not changed, "run `python -m docs.recorded`"
+    figures = (ROOT / "docs/results/figures.md").read_text()
+    assert recorded.filled(recorded.filled(figures, "figures", "a"), "figures", "b").count("\nb\n") == 1
+
+
+def test_measured_numbers_are_generated_or_name_their_run():
+    """Lengths and spreads in a section without a generated place need a commit, a command or a test, there or in the
+    introduction of the page."""
+    for page in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]:
+        text = page.read_text()
+        if re.search(r"commit \w+,? .*\d³ cells", text.partition("\n")[0]):
+            continue  # a recorded table
+        text = re.sub(r"<!-- (\w+) -->\n.*?<!-- /\1 -->", "", text, flags=re.DOTALL)
+        text = recorded.NUMBER.sub("", recorded.WHOLE_TABLE.sub("", text))
+        introduction, *sections = re.split(r"^## ", text, flags=re.MULTILINE)
+        for section in sections or [introduction]:
+            if re.search(r"\d( mm| ±)", section):
+                heading = section.partition("\n")[0]
+                assert RUN.search(section) or RUN.search(introduction), f"{page.relative_to(ROOT)}: {heading}"

@@ -11,6 +11,7 @@ from neuma_lib.config import obstacles
 from neuma_lib.config.obstacles import ColliderConfig
 from neuma_lib.io.simulator import simulator
 from neuma_lib.project import checks
+from neuma_lib.project.cases import case
 from neuma_lib.project.find import scene_files
 from neuma_lib.sim.clamps import Clamp
 from neuma_lib.sim.colliders import SIZES, Collider
@@ -99,8 +100,11 @@ def test_a_random_scene_may_have_another_friction(changed):
 
 
 def test_videos_of_one_law_share_their_obstacles(with_colliders, changed):
+    """Or have their own: the law is identified in all of them, but no correction is trained."""
+    other = changed(scenes={"Steps": {"like": "BouncyBall", "videos": [{"colliders": [STEP]}]}})
+    assert other.obstacles("Steps") == {} != other.obstacles("Steps_throw2")
     with refused("scenes.Steps.videos", problem="colliders"):
-        changed(scenes={"Steps": {"like": "BouncyBall", "videos": [{"colliders": [STEP]}]}})
+        case(other, "Steps", "neuma").each_video(lambda case: case.scene)
     again = changed(
         scenes={"Steps": {"like": "BouncyBall", "colliders": [STEP], "videos": [{"velocity": [0, 0, 1]}]}},
     )
@@ -173,10 +177,13 @@ def test_clamps_are_those_of_the_simulator(changed):
         "release": 0.1,
         "keyframes": [[0, [0, 0, 0], [0, 0, 0]]],
     }
-    settings = changed(scenes={"Held": {"like": "BouncyBall", "clamps": [clamp, {**clamp, "release": None}]}})
+    held = {"like": "BouncyBall", "velocity": [0, 0, 0], "clamps": [clamp, {**clamp, "release": None}]}
+    settings = changed(scenes={"Held": held})
     first, second = simulator(scene_files(settings, "Held", []).simulation).clamps
     assert first == Clamp((0, 0.5, 0), (1, 1, 1), 0.1, keyframes=((0, (0, 0, 0), (0, 0, 0)),))
     assert second.release == np.inf
     for wrong in ({"highest": [1, 0.5, 1]}, {"release": 0}, {"keyframes": 2 * clamp["keyframes"]}):
         with refused(f"scenes.Held.clamps.0.{next(iter(wrong))}"):
-            changed(scenes={"Held": {"like": "BouncyBall", "clamps": [clamp | wrong]}})
+            changed(scenes={"Held": held | {"clamps": [clamp | wrong]}})
+    with refused("scenes.Held", problem="starts at rest"):
+        changed(scenes={"Held": held | {"spin": [0, 1, 0]}})

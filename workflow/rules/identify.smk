@@ -12,14 +12,14 @@ for views in ("", "+views={views}"):
             mesh=of_each_video(of_replicate("mesh.ply")),
             transforms=of_each_video(of_data("dynamic/transforms.json")),
             velocity=of_each_video(of_replicate("velocity.json")),
-            obstacles=obstacle_meshes,
+            obstacles=meshes_of_videos,
         output:
             identified=f"{RESULTS}/{{scene}}/identified{views}.json",
         threads: identify_threads
         resources:
             gpu=GPU,
         params:
-            simulation=simulation_settings,
+            simulation=of_each_video(simulation_settings),
             densities=densities_of(SETTINGS.video_scenes),
             binding=SETTINGS.binding.plain(),
             identify=identify_settings,

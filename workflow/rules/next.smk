@@ -11,7 +11,7 @@ rule next:
         predicted=of_predicted(
             lambda own: [of_replicate(file)(own) for file in (*BODY.values(), "velocity.json")]
         ),
-        obstacles=obstacle_meshes,
+        obstacles=meshes_of_videos,
     output:
         page=f"{RESULTS}/{{scene}}/next.md",
         record=f"{RESULTS}/{{scene}}/next.json",
@@ -20,7 +20,7 @@ rule next:
     resources:
         gpu=GPU,
     params:
-        simulation=simulation_settings,
+        simulation=of_each_video(simulation_settings),
         densities=densities_of(SETTINGS.video_scenes),
         identify=identify_settings,
         next=SETTINGS.next.plain(),

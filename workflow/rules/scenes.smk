@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 
 from neuma_lib.config.obstacles import is_mesh_file
+from neuma_lib.io.files import listed
 from neuma_lib.project import paths
 from neuma_lib.project.settings import NO_TRUTH
 from workflow.inputs import image_list
@@ -176,6 +177,12 @@ def obstacle_meshes(wildcards):
     """Meshes of the colliders of a scene or experiment."""
     colliders = SETTINGS.obstacles(subject(wildcards)).get("colliders", [])
     return [each["shape"] for each in colliders if is_mesh_file(each["shape"])]
+
+
+def meshes_of_videos(wildcards):
+    """The same of all videos of a scene."""
+    meshes = of_each_video(obstacle_meshes)(wildcards)
+    return list(dict.fromkeys(mesh for each in meshes for mesh in listed(each)))
 
 
 def exposure(wildcards):

@@ -9,9 +9,8 @@ from neuma_lib.fitting.identify import identify
 from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.io.files import listed, write_json
 from neuma_lib.io.mesh import read_mesh
-from neuma_lib.io.simulator import simulator
 from neuma_lib.threads import use_threads
-from workflow.motion import filmed_bodies
+from workflow.motion import filmed_bodies, simulators
 from workflow.stage import run_script
 
 
@@ -27,7 +26,7 @@ def main(inputs, output, params, run) -> None:
             x = torch.from_numpy(sample_volume(mesh, settings.refined_particles, params.seed + 1))
             refined.append(body.resampled(x, mesh.volume, density, binding))
     identification = identify(
-        simulator(params.simulation),
+        simulators(params),
         *videos[0],
         settings,
         params.published,

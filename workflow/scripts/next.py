@@ -15,7 +15,7 @@ from neuma_lib.io.files import read_json, write_json, write_text
 from neuma_lib.io.particles import load_initial_state
 from neuma_lib.io.simulator import simulator
 from neuma_lib.threads import use_threads
-from workflow.motion import filmed_bodies
+from workflow.motion import filmed_bodies, simulators
 from workflow.stage import run_script
 
 
@@ -27,14 +27,14 @@ def main(inputs, output, params, run) -> None:
         update={key: params.scale * getattr(lab, key) for key in ("max_height", "max_speed")}
     )
     device, record = choose_device(params.device), read_json(inputs.identified)
-    fit, model = read_fit(record, settings), simulator(params.simulation)
+    fit, models = read_fit(record, settings), simulators(params)
     if (friction := recorded_friction(record)) is not None:
-        model = model.with_friction(friction)
+        models = [model.with_friction(friction) for model in models]
     starts = [record, *record.get("further_videos", [])]
     experiments = [
         Experiment(model, replace(InitialMotion.of(start["start"]), std=motion.std), body, video)
-        for start, (motion, body, video) in zip(
-            starts, filmed_bodies(inputs, params, settings, device), strict=True
+        for model, start, (motion, body, video) in zip(
+            models, starts, filmed_bodies(inputs, params, settings, device), strict=True
         )
     ]
     derivatives = None
@@ -49,7 +49,7 @@ def main(inputs, output, params, run) -> None:
         experiments,
         settings,
         lab,
-        rivals=read_rivals(record, settings, fit, lab.rivals),
+        rivals=read_rivals(record, settings, fit, max(lab.rivals, len(record["ties"]))),
         ties=bool(record["ties"]),
         derivatives=derivatives,
         reframe=params.rendered,
@@ -58,8 +58,7 @@ def main(inputs, output, params, run) -> None:
         log=run.log,
     )
     written, folder = choice.as_dict(params.scale), Path(output.page).parent
-    motions = [(option.body, option.path, option.cameras) for option in choice.options[:SHOWN]]
-    draw(output.picture, motions, model.dt)
+    draw(output.picture, [(option.experiment, option.path) for option in choice.options[:SHOWN]])
     write_json(output.record, written)
     write_text(output.page, page(written, Path(output.picture).name, folder.as_posix()))
     run.log(f"next: {describe(written['candidates'][0])}. All candidates: {output.page}")
