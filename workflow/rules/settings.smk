@@ -107,10 +107,18 @@ def scenes_that(holds, replicates=True):
 
 # Scenes of captures and of splats have no truth. Takes have the body and the motion from registration.
 TRUE_SCENE = scenes_that(lambda scene: scene.has_truth)
+# A scene of several bodies has a scene for each of them, which sees nothing of the others.
 PILE_SCENE = scenes_that(lambda scene: scene.bodies)
+PART_SCENE = scenes_that(lambda scene: scene.part_of)
+SINGLE_SCENE = scenes_that(lambda scene: not scene.bodies)
+LONE_SCENE = scenes_that(lambda scene: scene.has_truth and not scene.part_of)
 SPLAT_SCENE = scenes_that(lambda scene: scene.splat)
-OBJECT_SCENE = scenes_that(lambda scene: not (scene.captured and scene.captured.throw))
-PICTURED_SCENE = scenes_that(lambda scene: not scene.splat and not (scene.captured and scene.captured.throw))
+OBJECT_SCENE = scenes_that(lambda scene: not (scene.bodies or scene.captured and scene.captured.throw))
+PICTURED_SCENE = scenes_that(
+    lambda scene: not (
+        scene.splat or scene.bodies or scene.part_of or scene.captured and scene.captured.throw
+    )
+)
 TAKE_SCENE = scenes_that(lambda scene: scene.captured and scene.captured.throw, replicates=False)
 # Experiments have their own folder. Rules that also accept scenes have the wildcard `scene` for both.
 EXPERIMENT = f"experiments/{names_of(SETTINGS.experiments)}"
