@@ -185,22 +185,21 @@ def summary(tables: Tables) -> str:
 
 def overview(tables: Tables) -> str:
     """RMSE of Table 1 for the README, with its average on converged truths. Averages have their spread."""
-    same = tables.origin("yardstick") == tables.origin("table1")
-    rows = {**(error_rows(tables, "yardstick") if same else {}), **error_rows(tables, "table1")}
+    rows, reference = (error_rows(tables, name) for name in ("table1", "yardstick"))
+    if "True law" in reference and tables.origin("yardstick") == tables.origin("table1"):
+        rows["True law"] = reference["True law"]
     converged = error_rows(tables, "table1_converged")
     head = rows.pop("Method")
     last, last_converged = (row.index("Average") for row in (head, converged.pop("Method", head)))
-    titles = [*(title for title in error_rows(tables, "table1") if title in rows), "True law"]
-    short = [
-        [
-            title,
-            *(re.sub(r" ± (< )?[\d.]+", "", cell) for cell in rows[title][:last]),
-            rows[title][last],
-            converged[title][last_converged] if title in converged else "",
+    titles = sorted(dict.fromkeys([*converged, *rows]), key="True law".__eq__)
+    short = []
+    for title in titles:
+        means = [re.sub(r" ± (< )?[\d.]+", "", cell) for cell in rows.get(title, [""] * last)[:last]]
+        averages = [
+            values.get(title, [""] * (place + 1))[place]
+            for values, place in ((rows, last), (converged, last_converged))
         ]
-        for title in titles
-        if title in rows
-    ]
+        short.append([title, *means, *averages])
     sources = [
         f"[{text}](docs/results/{name}.md): commit {tables.origin(name)}"
         for name, text in (("table1", "six scenes"), ("table1_converged", "converged truths"))
