@@ -53,7 +53,7 @@ def swing_figure(result: Mapping[str, Any]) -> Figure:
     pictures.set_aspect("equal")
     pictures.invert_yaxis()
     pictures.set_xlabel("predicted outline [px]")
-    pictures.legend(loc="upper left", frameon=False)
+    pictures.legend(loc="lower right", frameon=False)
     for (name, own), colour in zip(clamps.items(), SEQUENCE, strict=False):
         for key, dash in (("predicted", "-"), ("fitted", ":")):
             values = own["grids"][-1][key]["contour_rms_by_frame"]
