@@ -282,6 +282,9 @@ class FamilyRun:
         The cost is evaluated at two standard deviations along the undetermined principal axes, on the side where it
         increases less. The variance is multiplied by the ratio of the predicted to the actual increase, up to
         `IdentifyConfig.spread`, which accounts for plateaus.
+
+        A fit that ends before its minimum has a slope, by which the cost increases less on one side without a plateau.
+        With `IdentifyConfig.level_plateaus`, the increase is that above the slope.
         """
         k, whole = self._constants, self._covariance()
         variances, axes = np.linalg.eigh(whole[:k, :k])
@@ -293,7 +296,9 @@ class FamilyRun:
             step = 2 * whole[:, :k] @ axis / math.sqrt(variance)
             residuals = self._simulate([self._u + step, self._u - step])
             costs = [math.inf if residual is None else self._cost(residual) for residual in residuals]
-            predicted, actual = step @ self.fit.curvature @ step, max(min(costs) - self.fit.cost, MIN_COST)
+            slope = 2 * step @ self.fit.slope if self.settings.level_plateaus else 0.0
+            lowest = min(costs[0] - slope, costs[1] + slope)
+            predicted, actual = step @ self.fit.curvature @ step, max(lowest - self.fit.cost, MIN_COST)
             inflated = min(variance * max(predicted / actual, 1.0), self.settings.spread**2)
             added += (inflated - variance) * np.outer(axis, axis)
         return added

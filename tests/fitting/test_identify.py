@@ -532,6 +532,20 @@ def test_a_plateau_widens_what_is_not_determined(flat):
     assert len(tried) == 2 and all(abs(u[1]) == pytest.approx(1.0) for u in tried)
 
 
+@pytest.mark.parametrize("level", [False, True])
+def test_a_fit_that_ends_before_the_minimum_of_a_quadratic_is_on_no_plateau(level):
+    """It is 0.8 of the step away, where the cost on one side is hardly higher. Above the slope it is the quadratic."""
+    chosen = settings({"hencky": ELASTIC}, spread=2.0, determined=0.1, level_plateaus=level)
+    run = FamilyRun(Family("hencky", ELASTIC), [None], [0], chosen)
+    H, away = np.pad(np.diag([1e4, 5.0]), (0, 9)), np.eye(11)[1] * 0.4
+    run.fit = Linearisation(H[None], (H @ -away)[None], away @ H @ away, 1.0)
+    run._covariance = lambda: np.diag([1e-4, 0.25] + [0.0] * 9)
+    run._simulate, run._cost = lambda points: points, lambda u: (u - away) @ H @ (u - away)
+    added = run.covariance_of_plateaus()
+    # The step is 1: (1 - 0.4)^2 - 0.4^2 = 0.2 of the quadratic.
+    np.testing.assert_allclose(added, np.diag([0.0, 0.0 if level else 0.25 / 0.2 - 0.25]), atol=1e-9)
+
+
 def test_a_plastic_body_is_no_elastic_one_and_is_pictured(tmp_path):
     truth = law("hencky", "von_mises", E=6e4, nu=0.3, yield_stress=2e3)
     identified = identified_in(truth, {"hencky": ELASTIC, "von_mises": PLASTIC})
