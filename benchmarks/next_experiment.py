@@ -136,11 +136,14 @@ class Lab:
         at = [placed(each, R, centre) for each in (self.truth, self.body)]
         return self.film(option.experiment.model, *at, own["velocity"], own["spin"], own["steps"])
 
-    def fitted(self, options: Sequence[Option], families: Sequence[str]) -> Identified:
-        """What is identified in the first launch and some other experiments."""
+    def fitted(
+        self, options: Sequence[Option], families: Sequence[str], before: Identified | None = None
+    ) -> Identified:
+        """What is identified in the first launch and some other experiments, also from what was known ``before``."""
         models = [self.model, *(option.experiment.model for option in options)]
         videos = [self.repeat(option) for option in options]
-        return identify(models, *self.first, self.chosen(families), other_videos=videos)
+        start = before and before.best.family.law_spec(before.best.values)
+        return identify(models, *self.first, self.chosen(families), start, other_videos=videos)
 
     def chosen(self, families: Sequence[str]) -> IdentifyConfig:
         known = self.settings.identify
@@ -192,7 +195,7 @@ def pool(lab: Lab, chunk: int, every: Sequence[str]) -> dict[str, Any]:
     for rank, option in list(enumerate(selection.options))[chunk::CHUNKS]:
         own = {"rank": rank, "kind": option.kind, "predicted": stds(option.forecast.fit, alone.settings)}
         try:
-            done.append({**own, **lab.summary(lab.fitted([option], family).best)})
+            done.append({**own, **lab.summary(lab.fitted([option], family, alone).best)})
         except NonFiniteError as error:
             done.append({**own, "refused": str(error)})
     return {"alone": lab.summary(alone.best), "seconds": seconds, "candidates": done}
@@ -201,9 +204,9 @@ def pool(lab: Lab, chunk: int, every: Sequence[str]) -> dict[str, Any]:
 def loop(lab: Lab, choose: bool, every: Sequence[str]) -> dict[str, Any]:
     """Experiments until all constants are determined, chosen ones or random launches."""
     options: list[Option] = []
-    rounds = []
+    rounds, result = [], None
     for number in range(EXPERIMENTS):
-        result = lab.fitted(options, every)
+        result = lab.fitted(options, every, result)
         rounds.append(
             {**lab.summary(result.best), "ties": result.ties, "kinds": [option.kind for option in options]}
         )

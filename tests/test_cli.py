@@ -37,7 +37,13 @@ def overlay(folder: Path, **settings) -> str:
 
 @core
 def test_the_shipped_settings_have_no_problems(project, capsys):
-    for name in ("demo", "studies/three_chains", "studies/two_throws", "studies/paper_tables"):
+    for name in (
+        "demo",
+        "studies/three_chains",
+        "studies/two_throws",
+        "studies/paper_tables",
+        "studies/next_experiment",
+    ):
         assert main(["check", f"config/{name}.yaml"]) == 0, capsys.readouterr().out
     capsys.readouterr()
     assert main(["check", "config/paper.yaml", "config/studies/paper_stride4.yaml"]) in (0, 1)

@@ -538,7 +538,7 @@ def test_a_fit_that_ends_before_the_minimum_of_a_quadratic_is_on_no_plateau(leve
     chosen = settings({"hencky": ELASTIC}, spread=2.0, determined=0.1, level_plateaus=level)
     run = FamilyRun(Family("hencky", ELASTIC), [None], [0], chosen)
     H, away = np.pad(np.diag([1e4, 5.0]), (0, 9)), np.eye(11)[1] * 0.4
-    run.fit = Linearisation(H[None], (H @ -away)[None], away @ H @ away, 1.0)
+    run.fit = Linearisation(H[None], np.zeros((1, 11)), away @ H @ away, 1.0)
     run._covariance = lambda: np.diag([1e-4, 0.25] + [0.0] * 9)
     run._simulate, run._cost = lambda points: points, lambda u: (u - away) @ H @ (u - away)
     added = run.covariance_of_plateaus()

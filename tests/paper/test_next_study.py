@@ -15,8 +15,13 @@ TINY = {
     "simulation": {"grid": 12},
     "geometry": {"particles": 200},
     "dataset": {"particles": 400, "frames": 9, "dynamic": {"width": 24, "height": 24}},
-    "advanced": {"next.candidates": 3, "identify.pyramid": [8, 24]},
+    "advanced": {"next.candidates": 3, "identify.pyramid": [8, 24], "identify.determined": 0.01},
 }
+
+
+@pytest.fixture(scope="module")
+def materials():
+    return drawn(["config/studies/next_experiment.yaml"], 3)
 
 
 def fit(rank, kind, std, predicted, error=0.1):
@@ -30,11 +35,13 @@ def fit(rank, kind, std, predicted, error=0.1):
     }
 
 
-def test_the_page_has_the_measures_of_the_issue():
+def test_the_page_has_the_measures_of_the_issue(materials):
     """One material: the choice leaves a half of the mean random launch, and twice the best in hindsight."""
-    (settings,) = set(map(id, drawn([], 0).values())) and list(drawn(["config/studies/next_experiment.yaml"], 3).values())[:1]
-    name = next(name for name in settings.random_scenes if settings.random.family(name) == "hencky")
-    chosen, launches = fit(0, "press", 0.1, 0.05), [fit(1, "launch", 0.2, 0.2, 0.2), fit(2, "launch", 0.2, 0.2, 0.2)]
+    name, settings = next((n, own) for n, own in materials.items() if own.random.family(n) == "hencky")
+    chosen, launches = (
+        fit(0, "press", 0.1, 0.05),
+        [fit(1, "launch", 0.2, 0.2, 0.2), fit(2, "launch", 0.2, 0.2, 0.2)],
+    )
     best = fit(3, "hang", 0.05, 0.1, 0.3)
     alone = {"std": {"G": 0.4, "K": 1.6}}
     pools = [{"alone": alone, "candidates": own} for own in ([best, chosen], launches)]
@@ -61,27 +68,33 @@ def test_the_page_has_the_measures_of_the_issue():
     assert "no launch" in page([refused], "command") and math.isfinite(len(refused.fits))
 
 
-def test_materials_outside_the_families_are_the_last_ones():
-    materials = drawn(["config/studies/next_experiment.yaml"], 3)
-    inside = [settings.random.family(name) in settings.identify.families for name, settings in materials.items()]
-    assert inside == [True] * 21 + [False] * 3
-    assert {settings.random.family(name) for name, settings in materials.items()} >= set(settings_families())
-
-
-def settings_families():
-    (settings, *_) = drawn([], 0).values() or drawn(["config/studies/next_experiment.yaml"], 0).values()
-    return settings.random.families
+def test_materials_outside_the_families_are_the_last_ones(materials):
+    families = [settings.random.family(name) for name, settings in materials.items()]
+    (settings, *_) = materials.values()
+    assert [family in settings.identify.families for family in families] == [True] * 21 + [False] * 3
+    assert set(families) >= set(settings.random.families)
 
 
 def test_a_tiny_study_runs_and_continues(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(study, "CHUNKS", 1)
     monkeypatch.setattr(study, "EXPERIMENTS", 2)
+
+    def with_few_families(files, outside):
+        materials = drawn(files, outside)
+        for name, own in materials.items():
+            families = {key: own.identify.families[key] for key in ("hencky", "neo_hookean")}
+            identify = own.identify.model_copy(update={"families": families})
+            materials[name] = own.model_copy(update={"identify": identify})
+        return materials
+
+    monkeypatch.setattr(study, "drawn", with_few_families)
     overlay, out, text = tmp_path / "tiny.yaml", tmp_path / "out.json", tmp_path / "page.md"
     overlay.write_text(yaml.safe_dump(TINY))
     command = [str(overlay), "--outside", "0", "--out", str(out), "--page", str(text)]
     main(command)
     results = read_json(out)
-    assert len(results) == 3 and "Task(" in capsys.readouterr().out
+    assert len(results) == 3 and not any("refused" in result for result in results.values())
+    assert "Task(" in capsys.readouterr().out
     (pool,) = (result for result in results.values() if "candidates" in result)
     assert {each["kind"] for each in pool["candidates"]} == {"launch", "press", "hang"}
     assert "| std, chosen experiment over random launches | 0.6 | " in text.read_text()
