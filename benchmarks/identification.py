@@ -53,7 +53,7 @@ def evaluate(job: tuple[str, Config, Mapping[str, Any]]) -> dict[str, Any]:
     name, settings, changes = job
     torch.set_num_threads(1)
     scene, data = settings.scene(name), Path(settings.data_root) / name
-    chosen = IdentifyConfig(**merged(settings.identify.plain(), changes))
+    chosen = IdentifyConfig(**merged(settings.identify_of(name).plain(), changes))
     body, motion = read_body(name, settings, chosen)
     video = load_observation(data / "dynamic/transforms.json", chosen.views).to(torch.float32)
     refined = refined_bodies(name, settings, chosen, body)

@@ -101,7 +101,7 @@ class Clock:
 
 def run(name: str, settings: Config, device: torch.device) -> dict[str, Any]:
     """One scene, from its files to a structured law: plain numbers."""
-    clock, scene, chosen = Clock(device), settings.scene(name), settings.identify
+    clock, scene, chosen = Clock(device), settings.scene(name), settings.identify_of(name)
     model, dt = simulator(settings, scene), scene.dt
     exposure = {"dt": dt, "exposure_samples": settings.dataset.exposure_samples}
     with clock.part("reading body"):

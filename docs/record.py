@@ -120,6 +120,7 @@ def main() -> None:
     )
     parser.add_argument("--commit", default=head(), help="code of the run")
     parser.add_argument("--configfile", help="settings of the run that lay over the defaults")
+    parser.add_argument("--config", help="option --config of the run, such as 'random={seed: 12, count: 12}'")
     options = parser.parse_args()
     results, out = Path(options.results), Path("docs/results")
     settings = "default settings (`config/config.yaml`)"
@@ -128,7 +129,9 @@ def main() -> None:
     origin = (
         f"{today}, commit {options.commit}, {grid(options.configfile)}³ cells, {options.machine}, {settings}"
     )
-    command = f"snakemake --configfile {options.configfile} --" if options.configfile else "snakemake"
+    given = f" --configfile {options.configfile}" if options.configfile else ""
+    given += f" --config '{options.config}'" if options.config else ""
+    command = f"snakemake{given} --" if given else "snakemake"
     for name in options.tables:
         source = results / f"{name}.md"
         if source.exists():

@@ -38,6 +38,7 @@ MADE_BY = {
     "views": "results/views.csv",
     "outside": "results/outside.csv",
     "identified": "results/identified.csv",
+    "identified_table1_converged": "results/identified_table1_converged.csv",
     "calibration": "calibration",
     "table1_systems": "results/table1_systems.csv",
     "table2_systems": "results/table2_systems.csv",
@@ -72,7 +73,7 @@ SUMMARY = (
         "Average",
     ),
 )
-"""Rows of the summary: text, page, tables, of which the first that has a method is used, and column."""
+"""Rows of the summary: text, page, tables (the first of the same record that has a method is used), and column."""
 END = "<!-- / -->"
 NUMBER = re.compile(rf"(<!-- ([\w/]+ [^\s>]+ [^\s>]+(?: \w+)?) -->).*?({END})", re.DOTALL)
 WHOLE_TABLE = re.compile(r"(<!-- table ([\w/]+) (\w+) -->\n).*?(<!-- /table -->)", re.DOTALL)
@@ -168,7 +169,8 @@ def summary(tables: Tables) -> str:
     for text, page, names, column in SUMMARY:
         cells = []
         for method in METHODS:
-            has = (name for name in names if (RMSE, method) in tables.rows(name))
+            same = (name for name in names if tables.origin(name) == tables.origin(names[0]))
+            has = (name for name in same if (RMSE, method) in tables.rows(name))
             cells.append(tables.cell(name, method, column) if (name := next(has, None)) else "")
         if any(cells):
             seed = re.search(r", seed \d+", tables.markdown.get(names[0], "")) if column == "Median" else None
@@ -183,23 +185,23 @@ def summary(tables: Tables) -> str:
 
 def overview(tables: Tables) -> str:
     """RMSE of Table 1 for the README, with its average on converged truths. Averages have their spread."""
-    rows = {**error_rows(tables, "yardstick"), **error_rows(tables, "table1")}
+    rows, reference = (error_rows(tables, name) for name in ("table1", "yardstick"))
+    if "True law" in reference and tables.origin("yardstick") == tables.origin("table1"):
+        rows["True law"] = reference["True law"]
     converged = error_rows(tables, "table1_converged")
     head = rows.pop("Method")
     last, last_converged = (row.index("Average") for row in (head, converged.pop("Method", head)))
-    titles = [*(title for title in error_rows(tables, "table1") if title in rows), "True law"]
-    short = [
-        [
-            title,
-            *(re.sub(r" ± (< )?[\d.]+", "", cell) for cell in rows[title][:last]),
-            rows[title][last],
-            converged[title][last_converged] if title in converged else "",
+    titles = sorted(dict.fromkeys([*converged, *rows]), key="True law".__eq__)
+    short = []
+    for title in titles:
+        means = [re.sub(r" ± (< )?[\d.]+", "", cell) for cell in rows.get(title, [""] * last)[:last]]
+        averages = [
+            values.get(title, [""] * (place + 1))[place]
+            for values, place in ((rows, last), (converged, last_converged))
         ]
-        for title in titles
-        if title in rows
-    ]
+        short.append([title, *means, *averages])
     sources = [
-        f"{', '.join(tables.markdown[name].split(', ')[:2])}: [{text}](docs/results/{name}.md)"
+        f"[{text}](docs/results/{name}.md): commit {tables.origin(name)}"
         for name, text in (("table1", "six scenes"), ("table1_converged", "converged truths"))
         if name in tables.markdown
     ]

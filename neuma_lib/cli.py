@@ -76,6 +76,15 @@ def _parser() -> argparse.ArgumentParser:
     )
     capture.add_argument("name", metavar="NAME", help="name of the capture and of its folder in captures/")
 
+    select = _command(
+        commands,
+        _select,
+        "select: mark the object of a capture in a photograph",
+        "Writes select.html into the folder of a capture. Open it in a browser and click the object, or draw a box "
+        "around it: the page shows the line for capture.yaml. Example: neuma select captures/mug",
+    )
+    select.add_argument("folder", metavar="FOLDER", help="folder of a capture, such as captures/mug")
+
     check = _command(
         commands,
         _check,
@@ -385,6 +394,12 @@ def _new_capture(options: argparse.Namespace) -> None:
     print(f"  copy your files to {folder}/photos, {folder}/stills and {folder}/videos")
     print(f"  neuma check {file}")
     print(f"  snakemake --cores 2 results/{options.name}/capture.md")
+
+
+def _select(options: argparse.Namespace) -> None:
+    from neuma_lib.viewer.select import write_select_page
+
+    print(f"Open {write_select_page(options.folder)} in a browser")
 
 
 def _clip(options: argparse.Namespace) -> None:

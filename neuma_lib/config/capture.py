@@ -111,10 +111,11 @@ class CaptureConfig(Section):
         "masks",
         description="folder of own masks, `photographs/<photograph>.png` and `<take>/<camera>/<frame>.png`; optional",
     )
-    object: dict[str, Rectangle] = Field(
+    object: dict[str, Rectangle | Pixel] = Field(
         {},
-        description="photograph -> (x0, y0, x1, y1) of a tight box around the whole object [px], from the upper left "
-        "corner of the displayed picture; needed if other objects are around; one is enough",
+        description="photograph -> (x0, y0, x1, y1) of a tight box around the whole object, or (x, y) of a point in "
+        "its middle [px], from the upper left corner of the displayed picture; needed if other objects are around; "
+        "one is enough",
     )
     center: Pixel | None = Field(
         None,
@@ -162,8 +163,8 @@ class CaptureConfig(Section):
             raise ValueError(
                 "center: it is a point in the frame of the board, which is not used here; leave it out"
             )
-        for name, (x0, y0, x1, y1) in self.object.items():
-            if x1 - x0 < 8 or y1 - y0 < 8:
+        for name, mark in self.object.items():
+            if len(mark) == 4 and (mark[2] - mark[0] < 8 or mark[3] - mark[1] < 8):
                 raise ValueError(
                     f"object.{name}: expected [left, upper, right, lower] in pixels, 8 apart or more"
                 )

@@ -40,7 +40,7 @@ class IdentifyConfig(Section):
         8000,
         ge=0,
         description="particles of the bodies on the finer grid, more than `geometry.particles`; 0: no finer grid, and "
-        "no constants of the material",
+        "no constants of the material, as for a truth on the grid of `simulation`",
     )
     refinement: float = internal(
         1.5, "grid cells and steps of the finer grid, relative to the simulation's", ge=1.25

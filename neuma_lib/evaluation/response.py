@@ -101,12 +101,27 @@ def band_of_test(test: PointTest, draws: Sequence[Law], scale: float = 1.0) -> d
 
 def inside(curves: Mapping[str, Any]) -> float | None:
     """Share of the visited points of a band at which the true curve lies in it. None without visited points."""
+    true, low, high = _visited_band(curves)
+    return float(((low <= true) & (true <= high)).mean()) if len(true) else None
+
+
+def half_width(curves: Mapping[str, Any]) -> float | None:
+    """Half width of a band relative to the true curve, of root mean squares over the visited points.
+
+    None without visited points.
+    """
+    true, low, high = _visited_band(curves)
+    return float(np.sqrt(((high - low) ** 2).mean() / (4 * (true**2).mean()))) if len(true) else None
+
+
+def _visited_band(curves: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The true curve and the ends of the band at the visited points of the band."""
     x, low, high = (np.array(curves["band"][key]) for key in ("x", "low", "high"))
     true = np.interp(x, curves["x"], curves["true"])
     start, end = curves["visited"]
     where = true if curves["by_stress"] else x
     seen = (where >= start) & (where <= end)
-    return float(((low <= true) & (true <= high))[seen].mean()) if seen.any() else None
+    return true[seen], low[seen], high[seen]
 
 
 def _axis(low: float, high: float) -> Tensor:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -29,8 +29,9 @@ VERDICTS = ("claim", "verdict", "RMSE here (mm)", "Chamfer distance in the paper
 """Columns of the table of verdicts."""
 RULE = (
     "A claim *holds* if its methods are lower on average and in most columns, the intervals mean ± standard deviation "
-    f"of the averages do not overlap, there are at least {MIN_REPLICATES} replicates, and no prediction of these "
-    "broke off. It *does not hold* if neither the average nor most columns support it, else it is *mixed*."
+    f"of the averages do not overlap, there are at least {MIN_REPLICATES} replicates, no prediction of these "
+    "broke off, and all this is so without the columns in which a training of the others diverged. It *does not hold* "
+    "if neither the average nor most columns support it, else it is *mixed*."
 )
 """Explanation of `Closer`, in its documentation and for readers of a table."""
 
@@ -106,11 +107,13 @@ class Frame:
         columns: name of each scene or experiment -> heading.
         rows: (quantity, method) -> values, in the order of the tables.
         broken: (method, column) of predictions that stopped early.
+        diverged: (method, column) of trainings that diverged.
     """
 
     columns: dict[str, str]
     rows: dict[tuple[str, str], Row] = field(default_factory=dict)
     broken: set[tuple[str, str]] = field(default_factory=set)
+    diverged: set[tuple[str, str]] = field(default_factory=set)
 
     def add(self, quantity: str, method: str, title: str, runs: Sequence[Sequence[float]]) -> None:
         """Add the values of a quantity and method, (replicates, columns)."""
@@ -198,11 +201,20 @@ class Closer:
             "a prediction broke off": broke,
         }
         reasons = [text for text, applies in caveats.items() if applies]
+        if not (reasons or self._holds_without_diverged(frame)):
+            reasons = ["not without the columns in which a training diverged"]
         here = f"{high.text()} against {low.text()}, lower in {lower} of {count}"
         if not (average or majority):
             return Verdict(self.text, FAILS, here, self._paper(frame))
         here += f"; {', '.join(reasons)}" if reasons else ""
         return Verdict(self.text, MIXED if reasons else HOLDS, here, self._paper(frame))
+
+    def _holds_without_diverged(self, frame: Frame) -> bool:
+        """Whether the claim depends on no column in which a training of the worse methods diverged."""
+        columns = self.columns or tuple(frame.columns)
+        sound = tuple(c for c in columns if not any((method, c) in frame.diverged for method in self.worse))
+        verdict = replace(self, columns=sound).holds(frame) if sound and sound != columns else None
+        return sound == columns or (verdict is not None and verdict.word == HOLDS)
 
     def _paper(self, frame: Frame) -> str:
         """The same comparison with the paper's distances."""
@@ -230,6 +242,7 @@ class Bound:
         count: number of columns that must be within the bound. None: the average over the columns must be.
         columns: scenes or experiments; all columns if empty.
         quantity: quantity that is bounded.
+        also: name and quantity [%] of the method that the verdict states, too.
     """
 
     text: str
@@ -239,6 +252,7 @@ class Bound:
     count: int | None = None
     columns: tuple[str, ...] = ()
     quantity: str = RMSE
+    also: tuple[str, str] | None = None
 
     @property
     def methods(self) -> set[str]:
@@ -262,6 +276,8 @@ class Bound:
         here = row.text(" mm" if self.quantity == RMSE else " %")
         here += f" against {of[0].text()}" if of else ""
         here += f", kept in {within[:-1].sum()} of {len(columns)}" if self.count is not None else ""
+        if self.also and (other := frame.select(self.also[1], [self.method], self.columns)):
+            here += f", {self.also[0]} {other[0].cells(1, shown)[-1]} %"
         word = FAILS if not met else MIXED if reasons else HOLDS
         return Verdict(self.text, word, "; ".join([here, *reasons]) if word == MIXED else here)
 

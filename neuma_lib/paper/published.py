@@ -12,6 +12,8 @@ from neuma_lib.paper.claims import Bound, Claim, Closer
 
 OUTSIDE = "outside_band"
 """Visited points of response curves at which the truth is outside the band of a law [%]."""
+BAND = "band_half_width"
+"""Half width of the band of a law over visited points, relative to the true curve [%]."""
 
 
 @dataclass(frozen=True)

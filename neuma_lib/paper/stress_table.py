@@ -6,16 +6,18 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from neuma_lib.evaluation.response import inside
+from neuma_lib.evaluation.response import half_width, inside
 from neuma_lib.evaluation.stress import PARTS
 from neuma_lib.evaluation.text_tables import as_csv, as_markdown
 from neuma_lib.paper.claims import Frame, Verdict, check, number, spread_note, verdict_lines
-from neuma_lib.paper.published import OUTSIDE, PaperTable
+from neuma_lib.paper.published import BAND, OUTSIDE, PaperTable
 
 HEADINGS = PARTS | {"asymmetric": "Antisymmetric part of the stress, which no material has"}
-OUTSIDE_HEADING = (
-    "Visited points at which the true response curve is outside the 95 % band of a law, in the worst test"
-)
+BANDS = {
+    OUTSIDE: "Visited points at which the true response curve is outside the 95 % band of a law, in the worst test",
+    BAND: "Half width of the 95 % band at the visited points relative to the true response curve, in the widest test",
+}
+"""Quantities of laws that have bands, and their headings."""
 
 
 def stress_table(
@@ -49,11 +51,12 @@ def stress_table(
         runs = list(zip(*(row[column] for column in columns), strict=True))
         if all("band" in test for of_run in runs for tests in of_run for test in tests.values()):
             frame.add(OUTSIDE, method, titles[method], [list(map(_outside, of_run)) for of_run in runs])
+            frame.add(BAND, method, titles[method], [list(map(_half_width, of_run)) for of_run in runs])
     verdicts = check(paper.claims, frame)
     lines = [["quantity", "method", "title", *columns, "Average"]]
     about = "Errors in per cent of the true stress, root mean squares over the true law's states on the reconstruction."
     text = [f"# {paper.heading}", "", about, ""]
-    for part, heading in (HEADINGS | ({OUTSIDE: OUTSIDE_HEADING} if frame.of(OUTSIDE) else {})).items():
+    for part, heading in (HEADINGS | (BANDS if frame.of(OUTSIDE) else {})).items():
         lines += [cells for row in frame.of(part) for cells in row.csv_rows()]
         cells = [[row.title, *row.cells(1, number)] for row in frame.of(part)]
         if part == "stress":
@@ -82,3 +85,9 @@ def _outside(tests: Mapping[str, Mapping]) -> float:
     """Visited points of response curves outside a law's own band [%], in the worst test."""
     parts = [inside(test) for test in tests.values()]
     return max((100 * (1 - part) for part in parts if part is not None), default=np.nan)
+
+
+def _half_width(tests: Mapping[str, Mapping]) -> float:
+    """Half width of a law's own band relative to the true curve [%], in the widest test."""
+    widths = [half_width(test) for test in tests.values()]
+    return max((100 * width for width in widths if width is not None), default=np.nan)

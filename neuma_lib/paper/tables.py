@@ -255,7 +255,9 @@ def chamfer_table(
             table.add(PRINTED, method, "*paper*", [[known.get(column, math.nan) for column in columns]])
         for column, heading in columns.items():
             runs = metrics[method][column]
-            signs = TRAINING_DIVERGED if any(run.get("stable") is False for run in runs) else ""
+            if any(run.get("stable") is False for run in runs):
+                table.diverged.add((method, column))
+            signs = TRAINING_DIVERGED * ((method, column) in table.diverged)
             for k, run in enumerate(runs):
                 if run.get("diverged"):
                     table.broken.add((method, column))

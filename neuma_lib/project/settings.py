@@ -233,6 +233,29 @@ class Config(Section):
         base, seeds = self.replicate(name)
         return [name, *(replicate_folder(video, seeds) for video in self.scenes[base].videos)]
 
+    def identify_of(self, name: str) -> IdentifyConfig:
+        """Settings of the identification of a scene, in its replicate.
+
+        A truth that was simulated on the grid of `simulation` has no limit for smaller cells. Identification of such
+        a scene uses no finer grid, and selects the family on the grid that it shares with the truth.
+
+        Raises:
+            InputError: the finer grid would not have more particles than `geometry.particles`.
+        """
+        refined, own = self.identify.refined_particles, self.geometry.particles
+        if 0 < refined <= own:
+            raise InputError(
+                "identify.refined_particles",
+                f"{refined} must exceed geometry.particles = {own}",
+                f"Set it to {4 * own}, or to 0 to disable the discretisation correction",
+            )
+        videos = [self.replicate(video)[0] for video in self.video_scenes(name)]
+        shared = any(
+            self.scene(video).has_truth and self.scene_truth(video).grid == self.simulation.grid
+            for video in videos
+        )
+        return self.identify.model_copy(update={"refined_particles": 0}) if shared else self.identify
+
     def body_scenes(self, column: str) -> list[str]:
         """Folders of the scenes whose laws the bodies of a scene or experiment have, in its replicate."""
         base, seeds = self.replicate(column)

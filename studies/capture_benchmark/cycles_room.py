@@ -107,9 +107,9 @@ class Cameras:
 class MovingBody(cycles.Body):
     """The body of a job, which may be hidden, with motion blur."""
 
-    def pose(self, frame: int, exposure: float) -> None:
-        """Set the geometry of a frame, or hide the body (-1), with an exposure [s]."""
-        render = bpy.context.scene.render
+    def pose(self, frame: int, exposure: float, read_out: float = 0.0) -> None:
+        """Set the geometry of a frame, or hide the body (-1), with an exposure and a time from top to bottom [s]."""
+        render, cycles = bpy.context.scene.render, bpy.context.scene.cycles
         if frame >= 0:
             self.show(frame)
             mesh = self.object.data
@@ -123,7 +123,9 @@ class MovingBody(cycles.Body):
         if self.object is not None:
             self.object.hide_render = frame < 0
         render.use_motion_blur = frame >= 0 and exposure > 0
-        render.motion_blur_shutter = max(exposure, 1e-4) * PER_SECOND
+        render.motion_blur_shutter = max(exposure + read_out, 1e-4) * PER_SECOND
+        cycles.rolling_shutter_type = "TOP" if read_out else "NONE"
+        cycles.rolling_shutter_duration = exposure / max(exposure + read_out, 1e-4)
 
 
 def shoot(path: str, samples: int) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,9 +16,13 @@ from neuma_lib.capture.masks.regions import iou
 from neuma_lib.capture.pictures import undistorted
 from neuma_lib.capture.tools import opencv
 from neuma_lib.geometry.skinning import skinning_matrix
+from neuma_lib.io.images import read_image_set, read_transforms
+from studies.capture_benchmark.room import Moving
 
 FINER = 4
 """Supersampling factor of silhouettes."""
+EVERY = 4
+"""Stride of the video frames that are compared with true silhouettes."""
 
 
 @dataclass(frozen=True)
@@ -155,6 +160,56 @@ def mask_agreement(
     whole = silhouette(vertices, faces, np.array(true["transform_matrix"]), true_lens(true))
     drawn = undistorted(np.repeat(255 * whole[..., None].astype(np.uint8), 3, axis=2), lens, longest)[..., 0]
     return iou(alpha > 127, drawn > 127)
+
+
+def mattes(path: str | Path) -> list[tuple[dict[str, Any], np.ndarray]]:
+    """Entries of a set of mattes, each with its opacity (H, W), uint8."""
+    return list(zip(read_transforms(path)["frames"], read_image_set(path).images[..., 3]))
+
+
+def photograph_agreement(
+    path: str | Path, rest: Moving, known: Mapping[str, Any], lens: Lens, longest: int
+) -> list[float]:
+    """IoU of the masks of photographs with the truth.
+
+    Args:
+        path: transforms.json of the mattes.
+        rest: the body at rest.
+        known: true cameras by stem of the file.
+        lens, longest: as of `mask_agreement`.
+    """
+    return [
+        mask_agreement(
+            alpha, rest.vertices[0], rest.faces, known[Path(frame["file_path"]).stem], lens, longest
+        )
+        for frame, alpha in mattes(path)
+    ]
+
+
+def video_agreement(
+    path: str | Path,
+    body: Moving,
+    numbers: np.ndarray,
+    true: Mapping[str, Any],
+    lens: Lens,
+    longest: int,
+    repeats: int = 1,
+) -> list[float]:
+    """IoU of the masks of every fourth frame of a camera with the truth.
+
+    Args:
+        path: transforms.json of the mattes.
+        body, numbers: the body, and the numbers of its frames at those of the video.
+        true: camera.
+        lens, longest: as of `mask_agreement`.
+        repeats: how often the video stores each picture.
+    """
+    return [
+        mask_agreement(
+            alpha, body.vertices[numbers[frame["step"] // repeats]], body.faces, true, lens, longest
+        )
+        for frame, alpha in mattes(path)[::EVERY]
+    ]
 
 
 def true_lens(camera: Mapping[str, Any]) -> Lens:

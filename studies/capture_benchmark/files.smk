@@ -8,12 +8,12 @@ DEMO_CAPTURE = f"{CAPTURES}/{PREFIX}{{item}}"
 DEMO_CAMERAS = sorted(DEMO.cameras)
 
 
-def demo_settings(*, of_objects=True):
-    """Settings that pictures depend on: those of one object, or of none."""
+def demo_settings():
+    """Settings that pictures of an object depend on."""
 
     def choose(wildcards):
         plain = DEMO.plain()
-        plain["objects"] = {wildcards.item: plain["objects"][wildcards.item]} if of_objects else {}
+        plain["objects"] = {wildcards.item: plain["objects"][wildcards.item]}
         return plain
 
     return choose

@@ -8,13 +8,15 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
+from scipy import ndimage
 
 from neuma_lib.data.blender.scene import Progress
 from neuma_lib.extras import require
 from neuma_lib.io.files import atomic
-from studies.capture_benchmark.pictures import dead_leaves
+from studies.capture_benchmark.furniture import RULER, furniture
+from studies.capture_benchmark.pictures import dead_leaves, ruler_picture
 from studies.capture_benchmark.room import Moving, Scenery, Shot, shoot
-from studies.capture_benchmark.settings import DemoCapturesConfig, DemoRoomConfig
+from studies.capture_benchmark.settings import DemoCapturesConfig, DemoObjectConfig, DemoRoomConfig
 from studies.capture_benchmark.stage import MIDDLE, Eye, lens_row, video_cameras
 
 PAPER = 0.0004
@@ -31,12 +33,16 @@ WALL_TEXEL = 2.0
 """Side of a wall's pixels, in pixels of the floor."""
 
 
-def scenery(room: DemoRoomConfig, page: np.ndarray, size: tuple[float, float]) -> Scenery:
-    """The room with textures and lamps, from the printed page, sRGB (H, W, 3), uint8, and its size [m]."""
+def scenery(
+    room: DemoRoomConfig, page: np.ndarray, size: tuple[float, float], item: DemoObjectConfig
+) -> Scenery:
+    """The room of an object with textures and lamps, from the printed page, sRGB (H, W, 3), uint8, and its size [m]."""
     half, wall = room.half, room.wall
     texel = 2 * half / room.texels
     corners = [np.array([[-half, 0, -half], [half, 0, -half], [half, 0, half], [-half, 0, half]])]
     pictures = [dead_leaves(2 * half, 2 * half, texel, room.seed)]
+    if not item.difficulties.board:
+        page, size = ruler_picture(*RULER), (RULER[0], RULER[1])
     wide, deep = np.array([size[0] / 2, 0, 0]), np.array([0, 0, size[1] / 2])
     middle = np.array(room.page) + [0, PAPER, 0]
     corners.append(
@@ -48,6 +54,9 @@ def scenery(room: DemoRoomConfig, page: np.ndarray, size: tuple[float, float]) -
         up = np.array([0.0, wall, 0.0])
         corners.append(np.stack([to - along + up, to + along + up, to + along, to - along]))
         pictures.append(dead_leaves(2 * half, wall, WALL_TEXEL * texel, room.seed + 1 + number))
+    for sides, textures in furniture(room, item):
+        corners += sides
+        pictures += textures
     return Scenery(
         corners=np.stack(corners) + MIDDLE,
         pictures=pictures,
@@ -71,11 +80,13 @@ def photograph(
     """Photographs (H, W, 3), uint8, of the body's first frame, each with its relative exposure."""
     rng = np.random.default_rng([demo.seed, 1, len(eyes)])
     settings = demo.photographs
+    (item,) = demo.objects.values()
     shots = [Shot(eye.c2w, lens_row(eye.lens), 0) for eye in eyes]
     lights = 1 + settings.exposure * rng.uniform(-1, 1, len(eyes))
     rendered = shoot(where, body, shots, samples=settings.samples, threads=threads, progress=progress)
     for light, pixels in zip(lights, rendered):
-        yield developed(light * pixels, settings.noise, rng), float(light)
+        blurred = shaken(pixels, item.difficulties.blur * demo.resolution, rng)
+        yield developed(light * blurred, settings.noise, rng), float(light)
 
 
 def backgrounds(
@@ -96,44 +107,96 @@ def film(
     seed: Sequence[int],
     threads: int,
     progress: Progress | None,
+    bystander: Moving | None = None,
 ) -> dict[str, list[np.ndarray]]:
     """Frames (H, W, 3), uint8, of each camera.
 
-    Only the regions of the body and its shadow are rendered. The rest is the empty scene.
+    Only the regions of the bodies and their shadows are rendered. The rest is the empty scene.
 
     Args:
         body: at all frames of all cameras.
         frames: numbers of the body's frames for each camera.
         empty: of `backgrounds`.
         seed: of noise.
+        bystander: another body in motion, at the same frames.
     """
     eyes, exposure, rng = video_cameras(demo), demo.videos.exposure, np.random.default_rng(seed)
+    (item,) = demo.objects.values()
+    trouble, others = item.difficulties, [bystander] if bystander else []
     shots: list[list[Shot]] = []
     for name, eye in eyes.items():
+        reach = 0.5 * (exposure + trouble.row_time * eye.lens.height)
         for frame in frames[name]:
-            moved = 0.5 * exposure * body.velocities[frame, ::EVERY]
-            swept = np.concatenate([body.vertices[frame, ::EVERY] + side * moved for side in (-1, 1)])
-            parts = regions(eye, swept, where.lamps, where.lamp_size)
+            parts = []
+            for each in (body, *others):
+                moved = reach * each.velocities[frame, ::EVERY]
+                swept = np.concatenate([each.vertices[frame, ::EVERY] + side * moved for side in (-1, 1)])
+                parts += regions(eye, swept, where.lamps, where.lamp_size)
             shots.append([Shot(eye.c2w, lens_row(eye.lens), int(frame), part) for part in parts])
     rendered = shoot(
         where,
-        body,
+        together(body, *others),
         [shot for parts in shots for shot in parts],
         samples=demo.videos.samples,
         exposure=exposure,
+        row_time=trouble.row_time,
         threads=threads,
         progress=progress,
     )
     order, pictures = iter(shots), {}
     for name in eyes:
         pictures[name] = []
-        for _ in frames[name]:
+        paths = hand_path(len(frames[name]), trouble.sway, rng)
+        for shift in paths:
             picture = empty[name].copy()
             for shot in next(order):
                 x0, y0, x1, y1 = shot.region
                 picture[y0:y1, x0:x1] = next(rendered)
+            if trouble.sway:
+                picture = ndimage.shift(picture, (*shift, 0), order=1, mode="nearest")
             pictures[name].append(developed(picture, demo.videos.noise, rng))
     return pictures
+
+
+def shaken(linear: np.ndarray, blur: float, rng: np.random.Generator) -> np.ndarray:
+    """A photograph (H, W, 3) blurred along a straight line, as by a turn of the hand.
+
+    Args:
+        linear: radiance.
+        blur: standard deviation of the length of the line [px].
+    """
+    if not blur:
+        return linear
+    length, turn = abs(rng.normal(0, blur)), rng.uniform(0, np.pi)
+    half = int(np.ceil(length / 2)) + 1
+    kernel = np.zeros((2 * half + 1,) * 2)
+    for along in np.linspace(-length / 2, length / 2, 41):
+        row, column = half + along * np.sin(turn), half + along * np.cos(turn)
+        y, x = int(row), int(column)
+        for dy, dx in np.ndindex(2, 2):
+            kernel[y + dy, x + dx] += (1 - abs(row - y - dy)) * (1 - abs(column - x - dx)) / 41
+    return ndimage.convolve(linear, kernel[..., None].astype(np.float32), mode="nearest")
+
+
+def hand_path(count: int, sway: float, rng: np.random.Generator) -> np.ndarray:
+    """Shifts (T, 2) [px] of a hand-held camera, a smooth random motion with this standard deviation."""
+    if not sway:
+        return np.zeros((count, 2))
+    steps = ndimage.gaussian_filter1d(rng.normal(size=(count, 2)), 6, axis=0, mode="wrap")
+    return sway * (steps - steps[0]) / steps.std()
+
+
+def together(*bodies: Moving) -> Moving:
+    """One mesh of bodies at the same frames."""
+    if len(bodies) == 1:
+        return bodies[0]
+    counts = np.cumsum([0] + [body.vertices.shape[1] for body in bodies[:-1]])
+    return Moving(
+        np.concatenate([body.vertices for body in bodies], axis=1),
+        np.concatenate([body.velocities for body in bodies], axis=1),
+        np.concatenate([body.faces + count for body, count in zip(bodies, counts)]),
+        np.concatenate([body.colors for body in bodies]),
+    )
 
 
 def regions(

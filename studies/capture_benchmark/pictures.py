@@ -21,17 +21,20 @@ TONES = np.array(
 """Colours of wood, stone and dust, less saturated than those of the objects."""
 
 
-def dead_leaves(width: float, height: float, texel: float, seed: int) -> np.ndarray:
+def dead_leaves(
+    width: float, height: float, texel: float, seed: int, tones: np.ndarray = TONES
+) -> np.ndarray:
     """A picture of overlapping shapes of all sizes (dead leaves model), sRGB (H, W, 3), uint8.
 
     Args:
         width, height: of the picture [m].
         texel: side of its pixels [m].
         seed: of the shapes.
+        tones: colours, sRGB, (6, 3).
     """
     rng = np.random.default_rng(seed)
     columns, rows = max(1, round(width / texel)), max(1, round(height / texel))
-    image = Image.new("RGB", (columns, rows), tuple(int(c) for c in TONES[0]))
+    image = Image.new("RGB", (columns, rows), tuple(int(c) for c in tones[0]))
     draw = ImageDraw.Draw(image)
     for radius in np.geomspace(LARGEST, SMALLEST, SIZES):
         pixels = radius / texel
@@ -42,7 +45,7 @@ def dead_leaves(width: float, height: float, texel: float, seed: int) -> np.ndar
         turns = rng.random(count) * 2 * np.pi
         sides = rng.integers(3, 8, count)
         colours = np.clip(
-            TONES[rng.integers(len(TONES), size=count)] + rng.normal(0, 14, (count, 1)), 20, 235
+            tones[rng.integers(len(tones), size=count)] + rng.normal(0, 14, (count, 1)), 20, 235
         )
         stretch = rng.uniform(0.5, 1.5, (count, 2))
         for middle, turn, side, colour, wide in zip(middles, turns, sides, colours.astype(int), stretch):
@@ -74,3 +77,10 @@ def page_picture(
             top, end = rows + bottom - round(y + h), rows + bottom - round(y)
             picture[top:end, left + round(x) : left + round(x + w)] = value
     return np.repeat(picture[..., None], 3, axis=2)
+
+
+def ruler_picture(length: float, width: float, texel: float) -> np.ndarray:
+    """A ruler with black and white fields of 2 cm, sRGB (H, W, 3), uint8, along its columns."""
+    fields = (np.arange(round(length / texel)) * texel / 0.02).astype(int) % 2
+    row = np.where(fields[:, None, None], BLACK, WHITE).astype(np.uint8)
+    return np.ascontiguousarray(np.broadcast_to(row, (len(row), round(width / texel), 3)).swapaxes(0, 1))

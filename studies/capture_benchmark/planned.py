@@ -41,10 +41,13 @@ def capture_settings(demo: DemoCapturesConfig, name: str) -> dict[str, Any]:
     """The capture.yaml of an object: measured inputs only, no ground truth."""
     item, board, (x, _, z) = demo.objects[name], demo.room.board, demo.room.page
     columns, rows = board.squares
-    return {
+    printed = {
         "board": board.model_dump(mode="json", exclude_defaults=True),
         # Point above which objects fall, from the lower left corner of the squares, rounded like a measurement.
         "center": [round(board.square * columns / 2 - x, 4), round(board.square * rows / 2 + z, 4)],
+    }
+    return {
+        **(printed if item.difficulties.board else {}),
         "cameras": {camera: {"exposure": demo.videos.exposure} for camera in sorted(demo.cameras)},
         "prior": item.prior,
         "density": item.density,

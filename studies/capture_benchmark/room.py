@@ -80,6 +80,7 @@ def shoot(
     *,
     samples: int,
     exposure: float = 0.0,
+    row_time: float = 0.0,
     threads: int = 1,
     progress: Progress | None = None,
 ) -> Iterator[np.ndarray]:
@@ -90,6 +91,7 @@ def shoot(
         shots: those of one frame of the body should be consecutive.
         samples: samples per pixel, denoised.
         exposure: exposure time [s] centred at the frame, with linear motion; 0: no motion blur.
+        row_time: of a rolling shutter from the top [s]; the time of a frame is that of the optical axis.
         threads: CPU cores for Blender.
 
     Raises:
@@ -124,6 +126,7 @@ def shoot(
             regions=np.array(regions, np.int64),
             samples=samples,
             exposure=exposure,
+            row_time=row_time,
             threads=threads,
         )
         run_worker(room_worker.__name__, job, len(shots), progress)

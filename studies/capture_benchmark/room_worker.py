@@ -28,9 +28,10 @@ def main(path: str) -> None:
     body = cycles_room.MovingBody(job)
     current = None
     for number, (lens, frame) in enumerate(job["shots"]):
-        if frame != current:
-            body.pose(int(frame), float(job["exposure"]))
-            current = frame
+        if (lens, frame) != current:
+            read_out = float(job["row_time"]) * float(job["lenses"][lens][3])  # of the larger picture
+            body.pose(int(frame), float(job["exposure"]), read_out)
+            current = lens, frame
         cameras.become(int(lens), job["c2w"][number], job["regions"][number])
         pixels = cycles_room.shoot(str(folder / "shot.exr"), int(job["samples"]))
         np.save(folder / f"{number:05d}.npy", pixels.astype(np.float16))

@@ -7,12 +7,13 @@ wildcard_constraints:
 
 rule demo_room:
     output:
-        room=f"{DEMO_DATA}/room.npz",
+        room=f"{DEMO_DATA}/{{item}}/room.npz",
     priority: 10  # all renders wait for it
     conda:
         CAPTURE_ENVIRONMENT
     params:
-        demo=demo_settings(of_objects=False),
+        demo=demo_settings(),
+        name="{item}",
         threads=1,
     script:
         "scripts/demo_room.py"
@@ -37,7 +38,7 @@ rule demo_drop:
 
 rule demo_photographs:
     input:
-        room=f"{DEMO_DATA}/room.npz",
+        room=f"{DEMO_DATA}/{{item}}/room.npz",
     output:
         photographs=[f"{DEMO_CAPTURE}/photos/{file}" for file in photograph_files(DEMO)],
         truth=f"{DEMO_DATA}/{{item}}/photographs.json",
@@ -51,7 +52,7 @@ rule demo_photographs:
 
 rule demo_videos:
     input:
-        room=f"{DEMO_DATA}/room.npz",
+        room=f"{DEMO_DATA}/{{item}}/room.npz",
         particles=f"{DEMO_DATA}/{{item}}/{{take}}.h5",
     output:
         videos=[f"{DEMO_CAPTURE}/videos/{{take}}/{camera}.mp4" for camera in DEMO_CAMERAS],
@@ -66,7 +67,7 @@ rule demo_videos:
 
 rule demo_capture:
     input:
-        room=f"{DEMO_DATA}/room.npz",
+        room=f"{DEMO_DATA}/{{item}}/room.npz",
         photographs=f"{DEMO_DATA}/{{item}}/photographs.json",
     output:
         stills=[f"{DEMO_CAPTURE}/stills/{camera}.png" for camera in DEMO_CAMERAS],

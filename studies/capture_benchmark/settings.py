@@ -65,6 +65,30 @@ class DemoDropConfig(Section):
     spin: Vector = Field(description="angular velocity at the start, room's axes [rad/s]")
 
 
+class DifficultiesConfig(Section):
+    """What makes a capture hard. The defaults make none."""
+
+    furniture: int = Field(
+        0,
+        ge=0,
+        description="pieces in the room, half of them low and near the object; its box is then marked",
+    )
+    board: bool = Field(
+        True, description="false: a ruler lies in place of the board, and its ends are marked"
+    )
+    row_time: float = Field(
+        0.0, ge=0, lt=1e-4, description="of the videos' rolling shutter, from the top [s]"
+    )
+    repeats: int = Field(1, ge=1, description="how often a video file stores each picture")
+    blur: float = Field(
+        0.0, ge=0, description="standard deviation of the length of a photograph's motion blur [px]"
+    )
+    sway: float = Field(0.0, ge=0, description="standard deviation of a hand-held video camera's shift [px]")
+    bystander: bool = Field(False, description="a second object rolls across the background of the videos")
+    marked: float = Field(1.5, ge=0, description="standard deviation of marks that a user sets [px]")
+    seed: int = Field(0, ge=0, description="of the furniture")
+
+
 class DemoObjectConfig(Section):
     """An object of the demo captures."""
 
@@ -80,10 +104,11 @@ class DemoObjectConfig(Section):
     )
     drops: dict[str, DemoDropConfig] = Field(description="drops by name")
     held_out: tuple[str, ...] = Field((), description="drops that no law is learned from")
+    difficulties: DifficultiesConfig = Field(DifficultiesConfig(), description="of room and cameras")
 
     @model_validator(mode="after")
     def _drops_are_known(self) -> DemoObjectConfig:
-        if not set(self.held_out) < set(self.drops):
+        if self.held_out and not set(self.held_out) < set(self.drops):
             raise ValueError("held_out: expected names of some drops, not of all")
         return self
 

@@ -467,7 +467,7 @@ def test_the_length_that_gravity_gives_makes_a_room_metric():
     assert metric.room_from_world.scale * 3 == pytest.approx(1, rel=1e-3)
     assert metric.scale.source == "gravity in the video"
     assert metric.scale.deviation == pytest.approx(0.05 / 9.81, rel=0.05)
-    one = Gravity(gravity.a, gravity.covariance, "one view in a plane", several=False)
+    one = Gravity(gravity.a, gravity.covariance, "one view in a plane", several=False, measured=False)
     assert "second camera" in one.known_length(places, "first").remedy
 
 

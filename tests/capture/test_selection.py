@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from tests.support.cluttered_rooms import cluttered_room
 from tests.support.errors import refused
@@ -49,6 +50,19 @@ def test_one_box_selects_the_object_in_all_photographs(room):
     masks = select(room, {first: box_around(room.masks[first])})
     ious = [iou(a, b) for a, b in zip(masks, room.masks)]
     assert np.mean(ious) > GOAL and min(ious) > 0.85
+
+
+def test_a_point_selects_the_object(room):
+    """The point farthest from the border of the object, as a person would click."""
+    first = largest(room)
+    inside = ndimage.distance_transform_edt(room.masks[first])
+    row, column = np.unravel_index(inside.argmax(), inside.shape)
+    lens = Lens(room.masks[first].shape[1], room.masks[first].shape[0], room.Ks[first], np.zeros(5))
+    box = box_in((column + 0.5, row + 0.5), None, lens, room.Ks[first])
+    assert box.guessed
+    np.testing.assert_allclose(box.middle, (column + 0.5, row + 0.5))
+    ious = [iou(a, b) for a, b in zip(select(room, {first: box}), room.masks)]
+    assert np.mean(ious) > GOAL - 0.01 and min(ious) > 0.85
 
 
 def test_without_points_two_boxes_locate_the_object(room):

@@ -79,6 +79,7 @@ def test_the_page_lists_every_candidate():
     assert "![motions of the best candidates](next.png)" in text and "--from results/Duck" in text
     assert "| 1 | launch it" in text and "| 2 | film the first launch" in text
     assert "| 6 % | 9 % | K | excluded |" in text and "| 7 % | 21 % |  | 0.3 |" in text
+    assert "\n1. Launch it" in text and "\n2. Film the first launch" in text
     assert "now 20 %" in text and "No candidate" not in text
     assert "No candidate" in page({**RECORD, "useful": False}, "next.png", "results/Duck")
 

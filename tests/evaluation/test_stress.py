@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 import torch
 
 from neuma_lib.evaluation.material_point import returned
+from neuma_lib.evaluation.response import half_width
 from neuma_lib.evaluation.stress import PARTS, VisitedStates, stress_errors, visit
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.catalogue import lame
@@ -218,6 +220,22 @@ def test_bands_are_scored_by_the_worst_test_of_every_replicate(last, word):
     assert list(rows) == ["constants"], "a law without a band has no row"
     assert float(rows["constants"]["c"]) == pytest.approx(np.mean([100 - 10 * n for n in last]), abs=1e-4)
     assert verdict.word == word, verdict.here
+    # The band is widest in the test whose truth lies in it everywhere.
+    assert verdict.here.partition(", half width of the bands ")[2].startswith("100.0 ± < 0.1 %")
+
+
+def test_half_widths_are_relative_to_the_visited_true_curve():
+    curves = {
+        "x": [0.0, 1.0, 2.0, 3.0],
+        "visited": [1.0, 2.0],
+        "by_stress": False,
+        "true": [9.0, 3.0, 4.0, 9.0],
+    }
+    band = {"x": [0.0, 1.0, 2.0, 3.0], "low": [0.0, 2.0, 1.0, 0.0], "high": [9.0, 4.0, 7.0, 9.0]}
+    assert half_width(curves | {"band": band}) == pytest.approx(math.sqrt((1**2 + 3**2) / (3**2 + 4**2)))
+    assert half_width(curves | {"band": band, "visited": [1.2, 1.8]}) is None
+    by_stress = curves | {"band": band, "by_stress": True, "visited": [3.5, 5.0]}
+    assert half_width(by_stress) == pytest.approx(3 / 4)
 
 
 def test_bounds_are_about_columns_of_their_tables_and_state_their_numbers():

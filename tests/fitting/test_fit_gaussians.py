@@ -102,6 +102,22 @@ def test_progress_and_degree(duck):
     assert [iteration for iteration, _ in seen] == [0, 1, 2, 3] and gaussians.shN.shape[1] == 0
 
 
+def test_rates_decay_geometrically(duck, monkeypatch):
+    """To a hundredth for the means and a tenth for all others at the end of the fit."""
+    rates, step = [], torch.optim.Adam.step
+
+    def recorded(self, *given):
+        rates.append({group["name"]: group["lr"] for group in self.param_groups})
+        return step(self, *given)
+
+    monkeypatch.setattr(torch.optim.Adam, "step", recorded)
+    fit_gaussians(*duck, SMALL.model_copy(update=dict(iterations=4)))
+    assert len(rates) == 4 and len(rates[0]) == 6
+    for name, first in rates[0].items():
+        end = 0.01 if name == "means" else 0.1
+        assert [each[name] for each in rates] == pytest.approx([first * end ** (k / 4) for k in range(4)])
+
+
 def test_ssim_equals_skimage():
     generator = torch.Generator().manual_seed(0)
     a = torch.rand(1, 40, 33, 3, generator=generator, dtype=torch.float64)

@@ -14,11 +14,12 @@ from neuma_lib.config.laws import LawConfig
 from neuma_lib.config.training import TrainingConfig
 from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.errors import NonFiniteError
+from neuma_lib.fitting import identify as identification
 from neuma_lib.fitting.families import MAX_COURANT, Family
 from neuma_lib.fitting.family_run import FamilyRun
 from neuma_lib.fitting.frame_batches import check_contact, first_contact
 from neuma_lib.fitting.identified import FamilyFit, Identified
-from neuma_lib.fitting.identify import _better_later, _prune, _select, identify
+from neuma_lib.fitting.identify import _better_later, _first_fit, _prune, _select, identify
 from neuma_lib.fitting.least_squares import (
     BLOCKS,
     Linearisation,
@@ -683,6 +684,34 @@ def test_less_flow_is_towards_the_elastic_limit_and_within_bounds():
     ]
     assert 30 < angles[0] < angles[1] < 90
     assert Family("elastic", ELASTIC).with_other_limits(values, (1, 2)) == []
+
+
+def test_a_plastic_family_starts_from_weak_flow_and_from_fits_of_others(monkeypatch):
+    """From its guesses and weaker limits of the last one, and from an elastic fit, then nearer to its elastic limit."""
+    starts = []
+
+    class Run(SimpleNamespace):
+        alive = True
+
+        def resembles(self, other):
+            return False
+
+        def begin(self, given, below):
+            starts.append([(values["E"], values["yield_stress"]) for values in given])
+
+    fit = SimpleNamespace(cost=1.0)
+    monkeypatch.setattr(
+        identification, "FamilyRun", lambda family, *given: Run(family=family, fit=fit, loss=1.0, rollouts=1)
+    )
+    elastic = Run(family=Family("elastic", ELASTIC), fit=fit, values={"E": 5e4, "nu": 0.2})
+    family = Family("plastic", law("hencky", "von_mises", E=3e4, nu=0.3, yield_stress=4e3))
+    published = {"E": 6e4, "nu": 0.3, "yield_stress": 8e3}
+    best = _first_fit(family, [], [elastic], published, settings({"elastic": ELASTIC}))
+    (first, second), guess = starts, (3e4, 4e3)
+    assert first == [pytest.approx(each) for each in (guess, (6e4, 8e3), (6e4, 2e3), (6e4, 500.0))]
+    limit = second[0][1]  # the elastic fit is the best one, and that of a family that this one contains
+    assert second == [pytest.approx((5e4, factor * limit)) for factor in (1, 1, 4, 16)]
+    assert best.rollouts == 2
 
 
 def test_a_published_law_gives_what_the_family_has():

@@ -244,3 +244,5 @@ def test_frame_weights_start_with_early_frames_and_end_uniform():
     first, last = frame_weights(0, 10, settings), frame_weights(60, 10, settings)
     assert first.tolist() == [1, 1, 0.5, 0.5, 0.25, 0.25, 0.125, 0.125, 0.0625, 0.0625]
     assert last.tolist() == [1] * 10
+    half = frame_weights(15, 10, settings)  # half of the first third
+    assert half.tolist() == pytest.approx([0.75 ** (k // 2) for k in range(10)])

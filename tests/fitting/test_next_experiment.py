@@ -188,6 +188,13 @@ def test_the_combination_that_becomes_determined_is_named():
     (name, (before, after)), *others = newly_determined(fitted(0.5 * np.eye(2)), mixed, chosen).items()
     assert not others and "^" in name and after < 0.1 <= before
     assert slope.shape == (2, 2)
+    # The error that all images share remains, and can be too large.
+    pairs = [
+        newly_determined(fitted(0.5 * np.eye(2)), mixed, chosen.model_copy(update={"model_std": std}))
+        for std in (0.0, 0.06, 0.1)
+    ]
+    (exact,), (wider,) = (pair.values() for pair in pairs[:2])
+    assert wider == pytest.approx([math.hypot(std, 0.06) for std in exact]) and pairs[2] == {}
 
 
 def test_predicted_motion_is_as_uncertain_as_that_of_drawn_constants(known):

@@ -1,15 +1,18 @@
 """Priors: what the networks are fitted to, that fitting works and is repeatable."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
 from safetensors.torch import save
 
 from neuma_lib.config.priors import RegressionConfig
+from neuma_lib.fitting import prior_training
 from neuma_lib.fitting.prior_launches import random_launch, random_rotations, reference_law, visited_stretches
 from neuma_lib.fitting.prior_regression import (
     Network,
+    _crushes,
     missing_states,
     sample_deformations,
     targets,
@@ -82,6 +85,26 @@ def test_launches_stay_in_the_box_and_hit_its_floor():
         assert elastic.shape[1] == trial.shape[1] == 3
         strains.append(float(elastic.log().abs().max()))
     assert max(strains) > 0.05
+
+
+def test_launches_start_low_and_anywhere_to_the_sides():
+    """Heights of the centre are in the lowest 30 % of what the cube's largest radius leaves, x and z in all of it."""
+    law, settings = reference_law(JELLY, RegressionConfig()), RegressionConfig(side_particles=4)
+    generator = torch.Generator().manual_seed(1)
+    states = [random_launch(law, generator, settings).state for _ in range(40)]
+    reaches = [0.1 + 0.5 * 3**0.5 * float(state.vol0.sum()) ** (1 / 3) for state in states]
+    places = torch.stack(
+        [(state.x.mean(0) - reach) / (1 - 2 * reach) for state, reach in zip(states, reaches, strict=True)]
+    )
+    assert -1e-4 <= places.min() and places.max() <= 1 + 1e-4
+    assert places[:, 1].max() <= 0.3 + 1e-4 and places[:, 1].max() > 0.25
+    assert places[:, [0, 2]].amin(0).max() < 0.2 and places[:, [0, 2]].amax(0).min() > 0.8
+
+
+def test_a_motion_crushes_by_its_states_and_not_by_trial_states():
+    crushed, sound = torch.full((2, 3), STRETCH_MIN / 2), torch.ones(2, 3)
+    assert _crushes((torch.cat([sound, crushed]), sound)) and _crushes(None)
+    assert not _crushes((sound, crushed))
 
 
 def test_soap_solves_an_ill_conditioned_matrix_problem():
@@ -228,3 +251,24 @@ def test_a_rough_prior_is_rough_by_its_return_map_alone(name):
     assert parts["elasticity"] < ROUGH[name] < CLOSE < parts["plasticity"]
     assert CLOSE <= report["chamfer"] < 0.5
     assert f"Chamfer {report['chamfer']:.4f}e-4 m^2. WARNING" in remark(report)
+
+
+def test_the_deviation_of_a_prior_is_that_of_all_frames(monkeypatch):
+    """Of a stub whose particle is k mm off in frame k of 4 of the first launch, and exact in the second."""
+    asked = []
+
+    class Stub:
+        steps = 100
+
+        def run(self, law, frames):
+            asked.append(frames)
+            x = torch.zeros(len(frames), 1, 3)
+            if len(asked) == 1:
+                x[:, 0, 1] = 1e-3 * torch.arange(1, len(frames) + 1)
+            return SimpleNamespace(x=x)
+
+    monkeypatch.setattr(prior_training, "random_launch", lambda *given: Stub())
+    report = evaluate_prior(reference_law(JELLY, TINY), JELLY, TINY, launches=2, frames=4)
+    assert asked == [[25, 50, 75, 100]] * 4
+    assert report["rmse"] == pytest.approx(1.25e-3) and report["rmse_worst"] == pytest.approx(4e-3)
+    assert report["chamfer"] == pytest.approx(2 * (1 + 4 + 9 + 16) / 4 * 1e-6 * 1e4 / 2)

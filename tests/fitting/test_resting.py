@@ -1,11 +1,13 @@
 """Stiffness from one still: derivatives, a synthetic twin of the silicone beam, and refusals."""
 
+import math
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from neuma_lib.errors import NonFiniteError
-from neuma_lib.fitting.resting import StillResiduals, fit_still
+from neuma_lib.fitting.resting import _CONTOUR_NOISE, _CORRELATED, StillResiduals, fit_still
 from neuma_lib.sim.equilibrium import extrapolated
 from tests.support import hanging_beam as beam
 from tests.support.errors import refused
@@ -41,6 +43,8 @@ def test_derivatives_of_all_unknowns_equal_finite_differences(still):
         assert np.quantile(error, 0.97) < 1e-3 * np.abs(slope).max(), k
         np.testing.assert_allclose(J[-8:, k], slope[-8:], atol=1e-5 * max(1.0, np.abs(slope[-8:]).max()))
     assert far > 1
+    # Points of the silhouette are up to 3 px apart, and residuals persist over 30 px of 2 px noise.
+    assert residuals.weight == pytest.approx(math.sqrt(3 / _CORRELATED) / _CONTOUR_NOISE, rel=0.1)
 
 
 def test_the_twin_of_the_silicone_beam_has_its_stiffness(still):

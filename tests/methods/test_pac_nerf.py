@@ -332,6 +332,9 @@ def test_bad_input_is_named(carried, loaded):
     video = film(carried, changed(ELASTIC, E=1e5))
     with refused("frames"):
         fit_pac_nerf(MODEL, carried, video, 0, FamilyConstants(ELASTIC), SMALL)
+    last = len(video.frames) - 1
+    with refused("frames", problem=f"{last} before and 0 after contact"):
+        fit_pac_nerf(MODEL, carried, video, video.frames[last], FamilyConstants(ELASTIC), SMALL)
     with pytest.raises(ValueError, match="fitted"):
         PacFamilyConfig(elasticity={"name": "hencky", "E": 1e5, "nu": 0.3}, fitted=("yield_stress",))
     with pytest.raises(ValueError, match="not both"):

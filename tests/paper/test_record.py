@@ -87,7 +87,9 @@ def record_all(project, monkeypatch, *options) -> tuple[str, str]:
 def test_pages_are_updated_from_tables_and_figures(project, monkeypatch):
     readme, page = record_all(project, monkeypatch)
     assert readme.startswith("# Title\n\nBefore.\n") and readme.endswith("<!-- /table1 -->\n\nAfter.\n")
-    assert "\nold\n" not in readme and "commit abc: [six scenes](docs/results/table1.md)." in readme
+    assert (
+        "\nold\n" not in readme and "[six scenes](docs/results/table1.md): commit abc, 36³ cells." in readme
+    )
     assert "| NeuMA | 6.0 | 6.0 | 6.0 | 6.0 | 6.0 | 6.0 | 6.0 ± 1.0 |  |" in readme
     assert "*paper*" not in readme and "Median" not in readme
     expected = (
@@ -133,7 +135,7 @@ def test_random_scenes_and_table1_convergeds_have_their_verdicts(project, monkey
     ) in page
     assert page.count("| [random](random.md) |") == 4
     averages = "| NeuMA | 6.0 | 6.0 | 6.0 | 6.0 | 6.0 | 6.0 | 6.0 ± 1.0 | 6.0 ± 1.0 |"
-    assert averages in readme and "| True law |" not in readme, "it is not in the table of the six scenes"
+    assert averages in readme and "| True law |  |  |  |  |  |  |  | 9.0 ± 1.0 |" in readme
     summary = (project / "docs/results/README.md").read_text()
     assert "|  | prior | NeuMA | true law | commit, grid |\n" in summary, (
         "methods without a row have no column"
@@ -204,6 +206,22 @@ def test_a_place_without_a_record_is_refused(project, monkeypatch, place, proble
     (project / "docs/page.md").write_text(place)
     with pytest.raises(SystemExit, match=problem):
         record_all(project, monkeypatch)
+
+
+def test_rows_of_another_record_are_not_compared(project, monkeypatch):
+    """The true law of the six scenes has another table, which may be older."""
+    columns = {column: column for column in PAPER["yardstick"].columns}
+    table = chamfer_table(
+        {"true_law": {c: [run(4.0)] for c in columns}}, {"true_law": "True law"}, columns, PAPER["yardstick"]
+    )
+    (project / "results/yardstick.md").write_text(table.markdown())
+    (project / "results/yardstick.csv").write_text(table.csv())
+    readme, _ = record_all(project, monkeypatch)
+    assert "| True law | 4.0 | 4.0 | 4.0 | 4.0 | 4.0 | 4.0 | 4.0 |  |" in readme
+    assert "| 6.0 ± 1.0 | 4.0 | abc," in (project / "docs/results/README.md").read_text()
+    readme, _ = record_all(project, monkeypatch, "--tables", "table1", "--commit", "def")
+    assert "True law" not in readme and "commit def" in readme
+    assert "true law" not in (project / "docs/results/README.md").read_text()
 
 
 def test_diverged_runs_are_marked(tmp_path):

@@ -135,12 +135,16 @@ def test_only_replicates_above_twice_the_mean_of_their_cell_are_named():
 METHODS = {**TITLES, "other": "Other"}
 
 
-def verdict_on(claim: Claim, errors: dict, paper: dict | None = None, columns=AB, **broken):
-    """Verdict on a claim; `errors`: method -> one list of replicates a column, broken: method -> what its runs add."""
+def verdict_on(claim: Claim, errors: dict, paper: dict | None = None, columns=AB, diverged=(), **broken):
+    """Verdict on a claim; `errors`: method -> one list of replicates a column, broken: method -> what its runs add,
+    diverged: (method, column) of trainings."""
     printed = PaperTable("tab:x", "X", "x", tuple(columns), paper or {}, (claim,))
     metrics = {
         method: {
-            column: [run(value, **broken.get(method, {})) for value in replicates]
+            column: [
+                run(value, stable=(method, column) not in diverged, **broken.get(method, {}))
+                for value in replicates
+            ]
             for column, replicates in zip(columns, values, strict=True)
         }
         for method, values in errors.items()
@@ -202,6 +206,22 @@ def test_a_prediction_that_stops_early_cannot_support_a_claim():
     verdict = verdict_on(CLOSER, errors, neuma=BROKEN)
     assert verdict.word == "mixed" and verdict.here.endswith("; a prediction broke off")
     assert verdict_on(CLOSER, errors, nclaw=BROKEN).word == "holds", "its error is even larger"
+
+
+def test_a_claim_does_not_depend_on_a_training_that_diverged():
+    """NCLaw's spread in column b is that of its average without column c."""
+    errors = {"nclaw": [[9] * 3, [1, 5, 9], [90] * 3], "neuma": [[8] * 3, [3] * 3, [1] * 3]}
+    columns = {**AB, "c": "c"}
+
+    def verdict(*diverged):
+        return verdict_on(CLOSER, errors, columns=columns, diverged=diverged)
+
+    assert verdict().word == verdict(("nclaw", "b")).word == "holds"
+    alone = verdict(("nclaw", "c"))
+    assert alone.word == "mixed"
+    assert alone.here.endswith("lower in 3 of 3; not without the columns in which a training diverged")
+    assert verdict(("neuma", "c")).word == "holds", "the error of its training counts"
+    assert verdict(*(("nclaw", column) for column in columns)).word == "mixed"
 
 
 def test_claims_without_rows_have_no_verdict():

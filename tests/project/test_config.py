@@ -397,6 +397,13 @@ class TestTruth:
         assert self.values(own.experiment_truth("letter_N_clay")) == (40, 2.5e-4, 9000)
         assert own.frame_steps("BouncyBall") == loaded.frame_steps("BouncyBall")
 
+    def test_a_truth_on_the_grid_of_the_simulation_is_identified_on_it_alone(self, loaded, changed):
+        assert loaded.identify_of("BouncyBall+seed=1").refined_particles == 0
+        assert loaded.identify_of("BouncyBall_converged+seed=1") == loaded.identify
+        assert loaded.identify.refined_particles > 0
+        refined = changed(dataset={"grid": 40}, random={"count": 0})
+        assert refined.identify_of("BouncyBall") == refined.identify
+
     def test_the_converged_table_has_96_cells_and_is_optional(self, loaded, changed):
         table = loaded.tables["table1_converged"]
         assert not table.default_target and set(loaded.tables["table1"].methods) < set(table.methods)

@@ -241,7 +241,7 @@ def test_a_body_that_cannot_rest_is_refused():
     """It falls, or slides off, for as many steps as allowed."""
     model, start = clamped_cube("resting")
     falling = replace(model, clamps=(), colliders=())
-    with refused("settle"):
+    with refused("settle", problem="m/s after 200 steps"):
         settle(falling, make_law("hencky"), start, max_steps=200)
 
 

@@ -95,3 +95,25 @@ def test_laws_that_bear_the_spin_elastically_stay_rigid():
         **{name: getattr(state, name).float() for name in ("x", "v", "mass", "vol0", "F", "C", "stuck")},
     )
     assert is_rigid(analytic_law(rigid["stiff"]), single)
+
+
+@pytest.mark.parametrize("strained", ["one axis", "expanded", "sheared", "compressed"])
+def test_a_law_is_rigid_in_every_direction(strained):
+    """A law that flows, or bears nothing, in one of them is not."""
+
+    def applies(F):
+        strain = F.diagonal(dim1=-2, dim2=-1) - 1
+        longer, shorter = (strain > 0).sum(-1), (strain < 0).sum(-1)
+        count = {"one axis": (1, 0), "expanded": (3, 0), "sheared": (1, 2), "compressed": (0, 3)}[strained]
+        return ((longer == count[0]) & (shorter == count[1]))[:, None, None]
+
+    def stiff():
+        return analytic_law(law("hencky", E=1e9, nu=0.3))
+
+    state, flows, gives = body(), stiff(), stiff()
+    assert is_rigid(flows, state)
+    flows.plasticity.evaluate = lambda F, weights: torch.where(applies(F), torch.eye(3).to(F), F)
+    assert not is_rigid(flows, state)
+    stress = gives.elasticity.evaluate
+    gives.elasticity.evaluate = lambda F, weights: torch.where(applies(F), 0.0, stress(F, weights))
+    assert not is_rigid(gives, state)

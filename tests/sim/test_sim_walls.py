@@ -11,6 +11,7 @@ from neuma_lib.sim.colliders import CONTACT_STIFFNESS, contact_radius
 from neuma_lib.sim.model import MPM, WALLS
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
+from tests.support.errors import refused
 from tests.support.sim_scenes import BOUNDARIES, DENSITY
 
 pytestmark = pytest.mark.core
@@ -204,3 +205,14 @@ def test_the_rebound_converges_to_the_same_floor(contact, E, rate):
     assert all(a < b for a, b in zip(heights, heights[1:], strict=False))
     assert heights[4] - heights[2] < rate * (heights[2] - heights[0])
     assert heights[4] - heights[3] < heights[3] - heights[2]
+
+
+def test_particles_that_start_outside_are_counted_and_the_first_is_named():
+    model = MPM(16, DT)
+    low, high = model.stencil_range
+    x = torch.full((5, 3), 0.5)
+    x[2, 1], x[4, 0] = high + 0.01, low - 0.01
+    one = torch.full((5,), 1e-3)
+    problem = f"2 of 5 particles start outside the grid (first: 2, at 0.5, {high + 0.01:.4g}, 0.5 m)"
+    with refused("state.x", problem=problem, remedy=f"[{low:.4g}, {high:.4g}] m"):
+        rollout(model, analytic_law(SOFT, dt=DT), State(x, torch.zeros(3), one, one), steps=2, frames=(2,))

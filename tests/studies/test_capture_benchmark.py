@@ -299,7 +299,8 @@ def room():
     size = tuple(n * board.square for n in board.squares)
     page = page_picture(*black_rectangles(board), size, (0.297, 0.42), texel)
     coarse = DEMO.room.model_copy(update={"texels": 256})
-    return filming.scenery(coarse, page, (page.shape[1] * texel, page.shape[0] * texel))
+    printed = page.shape[1] * texel, page.shape[0] * texel
+    return filming.scenery(coarse, page, printed, DEMO.objects["duck"])
 
 
 @pytest.mark.skipif(importlib.util.find_spec("bpy") is None, reason="needs Blender (bpy)")

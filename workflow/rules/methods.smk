@@ -208,15 +208,10 @@ def published_law(wildcards):
 @checked
 def identify_settings(wildcards):
     """Settings of an identification, in the views that its file names, if any."""
-    refined, own = SETTINGS.identify.refined_particles, SETTINGS.geometry.particles
-    if 0 < refined <= own:
-        raise InputError(
-            "identify.refined_particles",
-            f"{refined} must exceed geometry.particles = {own}",
-            f"Set it to {4 * own}, or to 0 to disable the discretisation correction",
-        )
     views = getattr(wildcards, "views", None)
-    return SETTINGS.identify.plain() | ({"views": [int(view) for view in views.split(",")]} if views else {})
+    return SETTINGS.identify_of(wildcards.scene).plain() | (
+        {"views": [int(view) for view in views.split(",")]} if views else {}
+    )
 
 
 @checked

@@ -1,4 +1,4 @@
-"""Masks of an object that is selected by a box in one or several photographs of a cluttered room.
+"""Masks of an object that is selected by a box or a point in one or several photographs of a cluttered room.
 
 A box in one photograph also contains what is behind the object. The other photographs decide. Each voxel near the
 object collects evidence (compare Campbell et al. 2010 and Kolev et al. 2009):
@@ -11,6 +11,9 @@ object collects evidence (compare Campbell et al. 2010 and Kolev et al. 2009):
 
 The mean over the photographs and over neighbouring voxels decides. One photograph against the object counts more than
 one for it, as in a visual hull, but is bounded, because something may stand in front of the object.
+
+A point becomes a box first: masks of some photographs are estimated from a box around the point, which then moves to
+the sides of the mask, or beyond where the mask reaches it, until both agree.
 
 Pictures are RGB, uint8, (H, W, 3). Masks are Boolean, (H, W).
 """
@@ -54,12 +57,24 @@ _STIFF = 8.0  # cost of an edge at the limit of this distance
 _OCCLUDED = -2.5  # log-likelihood ratio of the colours of something in front of the object
 
 
+_GUESS = 0.15  # half side of the first box around a point, as share of the longer side of the photograph
+_POINT_ROUNDS, _POINT_VIEWS = 6, 10  # boxes that are tried for a point, and photographs that decide on them
+_GROWTH = 0.3  # of a side that the mask reaches, in sides of the box
+_MARGIN, _SETTLED = 0.04, 0.85  # of the next box, in sides, and share of a box that its mask fills at the end
+
+
 @dataclass(frozen=True, eq=False)
 class Box:
-    """A rectangle around the object in a photograph, lower and upper corner (x, y) [px], (2,) each."""
+    """A rectangle around the object in a photograph.
+
+    Attributes:
+        lower, upper: corners (x, y) [px], (2,) each.
+        guessed: whether it is a first guess around a point on the object.
+    """
 
     lower: np.ndarray
     upper: np.ndarray
+    guessed: bool = False
 
     @property
     def middle(self) -> np.ndarray:
@@ -106,11 +121,16 @@ def box_in(rectangle: Sequence[float], orientation: int | None, lens: Lens, K: n
     """Box in an undistorted photograph.
 
     Args:
-        rectangle: left, upper, right, lower in the displayed photograph [px].
+        rectangle: left, upper, right, lower in the displayed photograph [px], or x and y of a point on the object.
         orientation: of `neuma_lib.capture.pictures.orientation_of`.
         lens: of the photograph.
         K: intrinsics of the undistorted one, (3, 3).
     """
+    if len(rectangle) == 2:
+        (pixels,) = sensor_pixels(np.array([rectangle], float), orientation, (lens.width, lens.height))
+        place = lens.directions(pixels[None])[0] * K[[0, 1], [0, 1]] + K[:2, 2]
+        half = _GUESS * 2 * K[:2, 2].max()
+        return Box(place - half, place + half, guessed=True)
     x0, y0, x1, y1 = rectangle
     ticks = np.linspace(0, 1, 9)
     x, y = x0 + (x1 - x0) * ticks, y0 + (y1 - y0) * ticks
@@ -139,7 +159,7 @@ def selected_masks(
         pictures: the photographs.
         viewmats: world to camera, OpenCV axes, (N, 4, 4).
         Ks: [px], pixel centres at +0.5, (N, 3, 3).
-        boxes: tight boxes by number of the photograph, at least one.
+        boxes: tight boxes or guesses by number of the photograph, at least one.
         points: of the reconstruction, (P, 3).
         seen: which points each photograph shows, Boolean, (N, P).
         saliency: `neuma_lib.capture.masks.saliency.Saliency`, or another function that returns (H, W) in [0, 1].
@@ -150,6 +170,62 @@ def selected_masks(
     Raises:
         InputError: a box contains no object, or does not fit the object that the other photographs show.
     """
+    chosen = {}
+    for i, box in boxes.items():
+        if box.guessed:
+            box = _fitted(i, box, pictures, viewmats, Ks, points, seen, saliency, name, floor)
+        chosen[i] = box
+    masks = _masks(pictures, viewmats, Ks, chosen, points, seen, saliency, name, floor, progress)
+    for i, box in chosen.items():
+        _check_filled(masks[i], box, f"{name}, photograph {i + 1}")
+    return masks
+
+
+def _fitted(
+    number: int,
+    box: Box,
+    pictures: Sequence[np.ndarray],
+    viewmats: np.ndarray,
+    Ks: np.ndarray,
+    points: np.ndarray,
+    seen: np.ndarray,
+    saliency: Callable[[np.ndarray], np.ndarray],
+    name: str,
+    floor: float | None,
+) -> Box:
+    """The box around the object at the middle of a guessed one. Arguments are those of `selected_masks`."""
+    others = [i for i in range(len(pictures)) if i != number]
+    used = [number, *others[:: max(1, -(-len(others) // _POINT_VIEWS))]]
+    some, views, intrinsics = [pictures[i] for i in used], viewmats[used], Ks[used]
+    size = np.array(pictures[number].shape[1::-1], float)
+    for _ in range(_POINT_ROUNDS):
+        box = Box(np.clip(box.lower, 0, size), np.clip(box.upper, 0, size))
+        mask = _masks(some, views, intrinsics, {0: box}, points, seen[used], saliency, name, floor)[0]
+        rows, columns = np.nonzero(mask)
+        if not len(rows):
+            break
+        lower, upper = np.array([columns.min(), rows.min()]), np.array([columns.max(), rows.max()]) + 1.0
+        left, right = (lower <= box.lower + 1) & (lower > 0), (upper >= box.upper - 1) & (upper < size)
+        if not (left | right).any() and ((upper - lower) / (2 * box.half)).min() > _SETTLED:
+            break
+        growth, margin = 2 * _GROWTH * box.half, _MARGIN * (upper - lower)
+        box = Box(lower - np.where(left, growth, margin), upper + np.where(right, growth, margin))
+    return box
+
+
+def _masks(
+    pictures: Sequence[np.ndarray],
+    viewmats: np.ndarray,
+    Ks: np.ndarray,
+    boxes: Mapping[int, Box],
+    points: np.ndarray,
+    seen: np.ndarray,
+    saliency: Callable[[np.ndarray], np.ndarray],
+    name: str,
+    floor: float | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[np.ndarray]:
+    """Masks of `selected_masks`, from boxes only, which they need not fill."""
     centre, size = locate(viewmats, Ks, boxes, points, seen, name)
     half = _REACH * size
     ticks = ((np.arange(_VOXELS) + 0.5) / _VOXELS * 2 - 1) * half
@@ -179,8 +255,6 @@ def selected_masks(
     masks = [np.zeros(picture.shape[:2], bool) for picture in pictures]
     for view, silhouette in zip(views, silhouettes):
         masks[view.number] = _segment(view, silhouette, masks[view.number].shape)
-    for i, box in boxes.items():
-        _check_filled(masks[i], box, f"{name}, photograph {i + 1}")
     return masks
 
 

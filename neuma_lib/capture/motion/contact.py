@@ -1,10 +1,41 @@
-"""Time at which a falling object touches the floor, from its masks."""
+"""Time and place at which a falling object touches the floor, from its masks."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
+
+from neuma_lib.capture.masks.regions import centroid, radius_of
+
+
+def place_on_floor(mask: np.ndarray, viewmat: np.ndarray, K: np.ndarray) -> tuple[np.ndarray, float] | None:
+    """Centre (3,) of an object that touches the floor at y = 0, from one view, and the relative error of its distance.
+
+    The ray through the lowest point of the silhouette meets the floor in front of the centre: by R tan(e / 2) for a
+    ball of radius R that is seen from an elevation e, and by nothing for a flat object that faces the camera. The ball
+    is assumed, with half of the difference as standard deviation. None if the camera does not look down at the object.
+
+    Args:
+        mask: Boolean, (H, W), not empty.
+        viewmat: world to camera, OpenCV axes, (4, 4).
+        K: intrinsics [px], pixel centres at +0.5, (3, 3).
+    """
+    R = viewmat[:3, :3]
+    eye = -R.T @ viewmat[:3, 3]
+    rows, columns = np.nonzero(mask)
+    pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))])
+    rays = R.T @ np.linalg.solve(K, pixels)
+    middle = R.T @ np.linalg.solve(K, np.append(centroid(mask), 1.0))
+    if eye[1] <= 0 or rays[1].min() >= 0 or middle[1] >= 0:
+        return None
+    down = rays[:, rays[1] < 0]
+    hit = float((eye[1] / -down[1] * np.hypot(down[0], down[2])).min())
+    elevation = np.arctan2(eye[1], hit)
+    shift = radius_of(mask) / K[0, 0] * np.hypot(hit, eye[1]) * np.tan(elevation / 2)
+    distance = hit + shift
+    centre = eye + distance / np.hypot(middle[0], middle[2]) * middle
+    return centre, 0.5 * float(shift) / distance
 
 
 def lowest_points(

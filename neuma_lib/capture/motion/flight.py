@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,8 @@ import numpy as np
 from neuma_lib.capture.calibration.vertical import Cue, check_vertical
 from neuma_lib.capture.masks.agreement import agreement
 from neuma_lib.capture.masks.regions import centroid
-from neuma_lib.capture.motion.contact import contact_time, lowest_points
-from neuma_lib.capture.motion.free_fall import FreeFall, Track, fit_flight
+from neuma_lib.capture.motion.contact import contact_time, lowest_points, place_on_floor
+from neuma_lib.capture.motion.free_fall import AT_CONTACT, FreeFall, Track, fit_flight
 from neuma_lib.capture.motion.spin import Spin, fit_spin, follow
 from neuma_lib.capture.motion.timing import (
     Offset,
@@ -30,6 +30,8 @@ TOLERATED_DEVIATIONS = 2.0
 
 The centroid of a mask is not the centre of mass. Registration measures gravity again, for the placed object, without
 this tolerance."""
+_AFTER = 4  # frames after the flight that are searched for the contact
+_MIN_SIDEWAYS = 0.05  # least velocity along the view, as share of the velocity
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +115,8 @@ class Flight:
 def find_flight(views: Sequence[Filmed], name: str, metric: bool = True, cues: Sequence[Cue] = ()) -> Flight:
     """Fit the free flight of a take.
 
-    A single camera requires a plane: the vertical one through the middle of the room that faces the camera.
+    A single camera requires a plane: the vertical one that faces the camera, through the place where the object
+    touches the floor, or through the middle of the room if the video does not show that.
 
     Args:
         views: of the cameras. The first one is the time reference.
@@ -144,11 +147,15 @@ def find_flight(views: Sequence[Filmed], name: str, metric: bool = True, cues: S
         offsets.append(offset)
         lines.append(line)
     fixed = [view.offset is not None for view in views]
-    plane = _plane(views[0]) if len(views) == 1 else None
+    touched = _touched(views[0], inside[0]) if len(views) == 1 else None
+    plane = _plane(views[0], touched[0] if touched else np.zeros(3)) if len(views) == 1 else None
     fall, kept = fit_flight(tracks, plane, offsets, fixed)
     contact = _contact(views, inside, fall)
     if np.isfinite(contact):
         fall, kept = fit_flight(tracks, plane, fall.offsets, fixed, contact)
+    if touched:
+        used = tracks[0].times[kept[0]]
+        fall = replace(fall, views=AT_CONTACT, distance=_distance_error(fall, views[0], used, touched[1]))
     if cues:
         check_vertical([*cues, fall.gravity.cue], name)
     gravity = (
@@ -187,10 +194,45 @@ def _offset(first: Filmed, second: Filmed, name: str) -> tuple[float, str]:
     return best.seconds, line
 
 
-def _plane(view: Filmed) -> tuple[np.ndarray, np.ndarray]:
-    """The vertical plane through the middle of the room that faces the camera: point and normal."""
+def _plane(view: Filmed, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The vertical plane through a point that faces the camera: point and normal."""
     eye = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
-    return np.zeros(3), np.array([eye[0], 0.0, eye[2]])
+    return point, (eye - point) * (1.0, 0.0, 1.0)
+
+
+def _touched(view: Filmed, flying: np.ndarray) -> tuple[np.ndarray, float] | None:
+    """Centre of the object when it touches the floor, and the relative error of its distance.
+
+    Of the frames around the end of the flight, that in which the object is lowest. None if it is the last one, since
+    the object may then be above the floor.
+    """
+    near = range(flying[-1] - 1, min(flying[-1] + _AFTER, len(view.masks)))
+    places = [place_on_floor(view.masks[k], view.viewmat, view.K) for k in near]
+    if not places or any(place is None for place in places):
+        return None
+    eye = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
+    lowest = int(np.argmin([np.linalg.norm(place[0] - eye) for place in places]))
+    return places[lowest] if lowest + 1 < len(places) else None
+
+
+def _distance_error(fall: FreeFall, view: Filmed, times: np.ndarray, touched: float) -> float:
+    """Relative standard deviation of gravity in one view.
+
+    The object may have been above the floor by a quarter of its way between frames. Its velocity along the view is
+    unknown and assumed to be like that across the view: motion towards the camera appears as an acceleration of
+    2 v u / (d |a|), with the velocity v in the picture at the middle of the flight and u along the view.
+    """
+    middle = np.array([times.mean()])
+    velocity = fall.v0 + fall.a * (middle[0] - fall.start)
+    eye = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
+    away = fall.place(middle)[0] - eye
+    distance, flat = float(np.linalg.norm(away)), float(np.hypot(away[0], away[2]))
+    last = fall.v0 + fall.a * (times[-1] - fall.start)
+    hover = abs(last[1]) * float(np.median(np.diff(times))) / 4 / max(eye[1], 1e-9)
+    speed = float(np.linalg.norm(velocity))
+    towards = max(float(np.hypot(velocity[0], velocity[2])), _MIN_SIDEWAYS * speed)
+    turn = 2 * speed * towards / (distance * float(np.linalg.norm(fall.a)))
+    return float(np.sqrt(touched**2 + hover**2 + turn**2 * (flat / distance) ** 2))
 
 
 def _at_rest(views: Sequence[Filmed], offsets: np.ndarray) -> np.ndarray | None:

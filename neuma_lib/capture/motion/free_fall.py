@@ -18,7 +18,9 @@ _MAX_RMS = 0.004  # tolerated root-mean-square residual, as share of the picture
 MAX_RMS_OF_RADIUS = 0.1
 """The same as share of the object's radius, since the centroid of a mask moves relative to the centre as the object
 turns. Different takes that fit so well are refused by the check of gravity."""
-TRIANGULATED = "triangulated"
+TRIANGULATED, IN_PLANE = "triangulated", "one view in a plane"
+AT_CONTACT = "one view in the plane of contact"
+"""How the distance of a fall from the cameras is known."""
 _ENDS = 0.2  # share of a track at either end that the first fit leaves out
 _MAX_DEVIATION = 4.0  # distance from the fit, in root mean squares of both coordinates
 _MAX_CORRELATION = 0.95  # of neighbouring frames
@@ -57,7 +59,8 @@ class FreeFall:
             consecutive residuals. 0 for fixed values.
         start: [s].
         rms: of the residuals [px].
-        views: `TRIANGULATED` or "one view in a plane".
+        views: `TRIANGULATED`, `AT_CONTACT` or `IN_PLANE`, where the plane is an assumption.
+        distance: relative standard deviation of all lengths by that of the plane. 0 if triangulated.
     """
 
     x0: np.ndarray
@@ -68,6 +71,7 @@ class FreeFall:
     start: float
     rms: float
     views: str
+    distance: float = 0.0
 
     def place(self, times: np.ndarray) -> np.ndarray:
         """Positions (T, 3) [m] at times on the first camera's clock [s]."""
@@ -82,7 +86,8 @@ class FreeFall:
     def gravity(self) -> Gravity:
         """The acceleration with its covariance."""
         source = f"{self.views}, {self.rms:.2f} px"
-        return Gravity(self.a, self.covariance[6:9, 6:9], source, self.views == TRIANGULATED)
+        covariance = self.covariance[6:9, 6:9] + self.distance**2 * np.outer(self.a, self.a)
+        return Gravity(self.a, covariance, source, self.views == TRIANGULATED, self.views != IN_PLANE)
 
 
 def fit_free_fall(
@@ -94,7 +99,7 @@ def fit_free_fall(
     """Fit the parabola by least squares of the reprojection errors.
 
     Several cameras triangulate within the fit. One camera needs the plane of the fall. Motion along its normal is then
-    fixed, and the covariance does not include an error of the plane.
+    fixed, and the covariance does not include an error of the plane (`FreeFall.distance`).
 
     Args:
         tracks: of one camera or more, frames before contact only.
@@ -176,7 +181,7 @@ def fit_free_fall(
         covariance=full @ covariance @ full.T,
         start=start,
         rms=float(np.sqrt(np.mean(errors**2))),
-        views="one view in a plane" if len(tracks) == 1 else TRIANGULATED,
+        views=IN_PLANE if len(tracks) == 1 else TRIANGULATED,
     )
 
 

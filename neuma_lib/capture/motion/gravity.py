@@ -29,12 +29,14 @@ class Gravity:
         covariance: (3, 3).
         source: how it was measured, for messages.
         several: whether it is from several cameras, which may show different takes.
+        measured: whether its size is measured. Otherwise a plane of the fall is assumed.
     """
 
     a: np.ndarray
     covariance: np.ndarray
     source: str
     several: bool = True
+    measured: bool = True
 
     @property
     def ratio(self) -> tuple[float, float]:
@@ -116,8 +118,11 @@ class Gravity:
             places: centres of the cameras of photographs in the room, (3,) each, by file name.
             name: of the videos.
         """
-        if not self.several:
-            remedy = "One camera does not measure it. Film with a second camera, or state a length (`length`)"
+        if not self.measured:
+            remedy = (
+                "One camera measures it only if it sees the contact with the floor from above. Film that, film with a"
+                " second camera, or state a length (`length`)"
+            )
             return InputError(name, "the scale is unknown, there is neither a board nor a length", remedy)
         files, centres = list(places), np.array(list(places.values()))
         distances = np.linalg.norm(centres[:, None] - centres, axis=-1)
@@ -127,8 +132,8 @@ class Gravity:
         spread = metres * deviation / ratio
         return InputError(
             name,
-            f"the scale is unknown. Gravity in the video gives {metres:.4g} +- {spread:.2g} m between the cameras of"
-            f" {files[a]} and {files[b]}",
+            f"the scale is unknown. Gravity in the video ({self.source}) gives {metres:.4g} +- {spread:.2g} m between"
+            f" the cameras of {files[a]} and {files[b]}",
             "Check on the contact sheets that times and frame rate are right, and write into capture.yaml: length:"
             f" {{metres: {metres:.4g}, deviation: {spread:.2g}, cameras: [{files[a]}, {files[b]}]}}",
         )

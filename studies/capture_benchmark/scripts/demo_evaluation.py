@@ -7,7 +7,7 @@ from pathlib import Path
 from neuma_lib.capture.calibration.lens import read_lens
 from neuma_lib.io.files import read_json, write_text
 from neuma_lib.io.hdf5 import read_arrays
-from neuma_lib.io.images import read_image_set, read_transforms
+from neuma_lib.io.images import read_transforms
 from studies.capture_benchmark.evaluation import (
     Truth,
     compare_cameras,
@@ -15,16 +15,14 @@ from studies.capture_benchmark.evaluation import (
     compare_masks,
     compare_motion,
     compare_registration,
-    mask_agreement,
+    photograph_agreement,
     table,
     tracer_error,
+    video_agreement,
 )
 from studies.capture_benchmark.sets import body_at_rest, body_of_drop
 from studies.capture_benchmark.settings import DemoCapturesConfig
 from workflow.stage import run_script
-
-EVERY = 4
-"""Stride of the video frames that are compared with true silhouettes."""
 
 
 def main(inputs, output, params, run) -> None:
@@ -40,14 +38,9 @@ def main(inputs, output, params, run) -> None:
         photographs = {Path(file).stem: camera for file, camera in known["photographs"].items()}
         cameras = compare_cameras(room["frames"], photographs, known["cameras"])
         rest = body_at_rest(demo, name)
-        agreements = {"photographs": []}
-        for frame, alpha in mattes(files[name]["static"]):
-            true = photographs[Path(frame["file_path"]).stem]
-            agreements["photographs"].append(
-                mask_agreement(
-                    alpha, rest.vertices[0], rest.faces, true, lenses["photographs"], params.longest[name]
-                )
-            )
+        static, longest = files[name]["static"], params.longest[name]
+        agreed = photograph_agreement(static, rest, photographs, lenses["photographs"], longest)
+        agreements = {"photographs": agreed}
         rows += [(capture, "", row) for row in cameras + compare_masks(agreements)]
         for drop in demo.objects[name].drops:
             of_drop = compare_drop(demo, name, drop, known, lenses, files[name], params)
@@ -62,29 +55,16 @@ def main(inputs, output, params, run) -> None:
     run.log(f"{sum(row.reached is True for _, _, row in rows)} goals reached, {len(missed)} missed")
 
 
-def mattes(path):
-    """Entries of a set of mattes, each with its opacity (H, W), uint8."""
-    return list(zip(read_transforms(path)["frames"], read_image_set(path).images[..., 3]))
-
-
 def compare_drop(demo, name, drop, known, lenses, files, params):
     of_drop = files["drops"][drop]
     arrays, _ = read_arrays(of_drop["particles"], ("time", "x", "mass", "tracers"))
     truth = Truth(*(arrays[key] for key in ("time", "x", "mass", "tracers")))
     body, numbers = body_of_drop(demo, name, drop, of_drop["particles"])
+    longest, repeats = params.longest[name], demo.objects[name].difficulties.repeats
     agreements = {}
     for camera, path in of_drop["mattes"].items():
-        agreements[camera] = [
-            mask_agreement(
-                alpha,
-                body.vertices[numbers[camera][frame["step"]]],
-                body.faces,
-                known["cameras"][camera],
-                lenses[camera],
-                params.longest[name],
-            )
-            for frame, alpha in mattes(path)[::EVERY]
-        ]
+        true = known["cameras"][camera], lenses[camera]
+        agreements[camera] = video_agreement(path, body, numbers[camera], *true, longest, repeats)
     rows = compare_masks(agreements) + compare_flight(read_json(of_drop["flight"]), known, truth, drop)
     if of_drop["registration"]:
         registration = read_json(of_drop["registration"])

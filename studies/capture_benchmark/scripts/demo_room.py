@@ -22,7 +22,8 @@ def main(inputs, output, params, run) -> None:
     page = page_picture(
         *black_rectangles(board), tuple(n * board.square for n in board.squares), PAPERS["A3"], texel
     )
-    where = scenery(demo.room, page, (page.shape[1] * texel, page.shape[0] * texel))
+    size = page.shape[1] * texel, page.shape[0] * texel
+    where = scenery(demo.room, page, size, demo.objects[params.name])
     write_room(output.room, where, backgrounds(demo, where, params.threads, run.progress))
     pixels = np.prod(where.pictures[0].shape[:2])
     run.log(f"floor of {pixels / 1e6:.0f} million pixels, backgrounds of {len(demo.cameras)} cameras")
