@@ -338,7 +338,7 @@ class Material:
         done = [k for k, each in enumerate(rounds, 1) if max(each["std"].values()) < self.limit]
         return [min(done, default=EXPERIMENTS + 1)] if rounds else []
 
-    def told_apart(self) -> list[bool]:
+    def distinguished(self) -> list[bool]:
         """Whether no other family predicts as well after two experiments, and the family is the true one."""
         after = [each for each in self.rounds[True][:2]][-1:]
         return [not each["ties"] and (each["family"] == self.family or not self.inside) for each in after]
@@ -391,7 +391,7 @@ def page(materials: Sequence[Material], command: str) -> str:
     z = [abs(fit["error"][key]) / fit["predicted"][key] for fit in known for key in fit["error"]]
     calibration = [log_std(fit, "predicted") - log_std(fit) for fit in fits]
     chosen, random = ([n for each in materials for n in each.experiments(choose)] for choose in (True, False))
-    apart = [told for each in materials for told in each.told_apart()]
+    distinct = [own for each in materials for own in each.distinguished()]
 
     def ratio(measure: Callable[[dict[str, Any]], float], some: Sequence[Material], *kinds: str) -> str:
         logs = [value for each in some for value in each.over_random(measure, *kinds)]
@@ -421,7 +421,11 @@ def page(materials: Sequence[Material], command: str) -> str:
             [f"errors within {k} predicted std", n, z and f"{np.mean(np.less(z, k)):.2f}"]
             for k, n in NORMAL.items()
         ),
-        ["families told apart after two experiments", "22 of 24", apart and f"{sum(apart)} of {len(apart)}"],
+        [
+            "families distinguished after two experiments",
+            "22 of 24",
+            distinct and f"{sum(distinct)} of {len(distinct)}",
+        ],
     ]
     measures = as_markdown(["measure", "goal", "result"], [row for row in rows if row[2]])
     table = as_markdown(HEADER, [each.row() for each in materials])

@@ -215,22 +215,23 @@ def test_videos_have_their_own_colliders_and_clamps():
 
 
 def test_a_joint_fit_starts_from_that_to_the_first_video(monkeypatch):
+    """From its constants at the last level."""
     begun, begin = [], FamilyRun.begin
 
     def recorded(run, starts, *args, **options):
         begin(run, starts, *args, **options)
-        begun.append((len(run.videos), list(starts), run.values))
+        begun.append((run, list(starts)))
 
     monkeypatch.setattr(FamilyRun, "begin", recorded)
     body, seen = video_of(ELASTIC, V0, FRAMES[:11])
     others = [(known(body), body, seen)]
     options = dict(pyramid=(8, 32), start_from_first_video=True)
     identified_in(ELASTIC, {"hencky": ELASTIC}, other_videos=others, **options)
-    (count, _, alone), (both, starts, _), *_ = begun
-    assert (count, both) == (1, 2) and alone in starts
+    (alone, _), (both, starts), *_ = begun
+    assert (len(alone.videos), len(both.videos)) == (1, 2) and alone.refined and alone.values in starts
     begun.clear()
     identified_in(ELASTIC, {"hencky": ELASTIC}, other_videos=others, pyramid=(8, 32))
-    assert all(count == 2 for count, *_ in begun)
+    assert all(len(run.videos) == 2 for run, _ in begun)
 
 
 def test_videos_count_alike_however_long():

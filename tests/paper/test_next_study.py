@@ -60,7 +60,7 @@ def test_the_page_has_the_measures_of_the_issue(materials):
         f"experiments, median of random launches |  | {study.EXPERIMENTS + 1}",
         "predicted over reported std, median | 1 | 1.00",
         "errors within 1 predicted std | 0.68 | 0.50",
-        "families told apart after two experiments | 22 of 24 | 1 of 1",
+        "families distinguished after two experiments | 22 of 24 | 1 of 1",
     ):
         assert f"| {row} |" in text, text
     assert f"| {name} | press | 80 % | 10 % | 20 % | 40 % | 10 % | 2 | 7 |" in text
