@@ -61,6 +61,7 @@ if workflow.is_main_process and Path(workflow.main_snakefile).resolve() == ROOT 
             *SETTINGS.methods,
             *SETTINGS.experiments,
             *SETTINGS.specimens,
+            *SETTINGS.stills.swings,
             *SETTINGS.priors.laws,
             *tables,
         ],

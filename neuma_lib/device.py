@@ -7,13 +7,16 @@ kernels.
 
 from __future__ import annotations
 
+import inspect
 import os
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import torch
 import warp as wp
@@ -69,6 +72,29 @@ def native_source(module: str, suffix: str = ".cu") -> dict[str, str]:
     """
     _, *parts = re.split(r"^//// (\w+)\n", Path(module).with_suffix(suffix).read_text(), flags=re.MULTILINE)
     return dict(zip(parts[::2], parts[1::2], strict=True))
+
+
+def typed(types: Mapping[str, Any]) -> SimpleNamespace:
+    """Decorators of Warp that add the types of arguments without an annotation, by their names.
+
+    Returns:
+        ``func``, ``func_native(source)``, and ``kernel(module)`` without automatic adjoints.
+    """
+
+    def annotate(function: Callable) -> Callable:
+        own, names = function.__annotations__, inspect.signature(function).parameters
+        # Warp reads their order, too.
+        function.__annotations__ = {n: own[n] if n in own else types[n] for n in names} | own
+        return function
+
+    # Warp finds the type of a native function's result if its only decorator is called func_native.
+    return SimpleNamespace(
+        func=lambda function: wp.func(annotate(function)),
+        func_native=lambda source: lambda function: wp.func_native(source)(annotate(function)),
+        kernel=lambda module: (
+            lambda function: wp.kernel(annotate(function), enable_backward=False, module=module)
+        ),
+    )
 
 
 def warp_stream(device: torch.device) -> wp.Stream | None:

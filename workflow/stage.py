@@ -38,7 +38,9 @@ LOG_FORMAT = "[%(asctime)s] %(message)s"
 
 _LOGGER = logging.getLogger("neuma_lib.stage")
 _LOG_LOGGER = logging.getLogger("neuma_lib.log")  # for the log alone
-_SECONDS = "core seconds: {:.2f} to start, {:.2f} of work"  # read by neuma_lib.project.timings
+_USED = (
+    "core seconds: {:.2f} to start, {:.2f} of work; memory: {:.1f} MB"  # read by neuma_lib.project.timings
+)
 
 
 @contextmanager
@@ -85,13 +87,19 @@ def run_script(main: Callable, snakemake) -> None:
         _LOG_LOGGER.info(versions.line())
         load_laws(snakemake.config.get("extensions") or ())
         main(snakemake.input, snakemake.output, snakemake.params, run)
-        _LOG_LOGGER.info(_SECONDS.format(started, _core_seconds() - started))
+        _LOG_LOGGER.info(_USED.format(started, _core_seconds() - started, _memory()))
 
 
 def _core_seconds() -> float:
     """Seconds that all threads of this process and its finished children have kept a core busy."""
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return sum(usage.ru_utime + usage.ru_stime for usage in used)
+
+
+def _memory() -> float:
+    """Most memory that this process or one of its finished children had at once [MB]."""
+    used = [resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return max(used) / (2**20 if sys.platform == "darwin" else 2**10)
 
 
 class Stage:

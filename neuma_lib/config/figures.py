@@ -69,6 +69,9 @@ class FiguresConfig(Section):
         "scenes of the tests of material points",
         min_length=1,
     )
+    pile: str | None = internal(
+        None, "experiment with some of the bodies of a scene of several; null: no figure"
+    )
     obstacles: tuple[str, ...] = internal(
         ("JellyStair", "ClayPress", "SandGlass"),
         "scenes with colliders whose true motions are shown",

@@ -94,6 +94,7 @@ class SceneBodyConfig(Section):
         1000.0, description="mass density, as of a scene [kg/m^3]"
     )
     law: LawConfig = Field(description="the true material")
+    family: str | None = internal(None, "a name in identify.families if it is known; null: it is selected")
     appearance: AppearanceConfig = Field(description="appearance in Blender")
 
 
@@ -164,6 +165,9 @@ class SceneConfig(Section):
     images: SuppliedConfig = Field(SuppliedConfig(), description="supplied image sets")
     captured: CapturedConfig | None = internal(
         None, "the capture of a scene without truth; the workflow sets it"
+    )
+    part_of: tuple[str, str] | None = internal(
+        None, "scene of several bodies and name of the one that this scene shows; `project.loading` sets it"
     )
     splat: SplatConfig | None = Field(
         None,

@@ -36,6 +36,17 @@ class RestingBodyConfig(Section):
     )
 
 
+class SwingConfig(Section):
+    """Silhouettes of a body that is held, as a still shows, and then released."""
+
+    body: str = Field(description="body of `stills.bodies` whose mu / rho predicts the motion")
+    still: str = Field(description="name in frames.json of the record of the held body")
+    silhouettes: str = Field(
+        description="folder of the label maps, with times.json, relative to `stills.root`"
+    )
+    held: RegionConfig = Field(description="region of the undeformed body that a force against gravity holds")
+
+
 class StillsConfig(Section):
     """Stiffness over density of bodies at rest under gravity, each in photographs with one marker."""
 
@@ -47,6 +58,10 @@ class StillsConfig(Section):
         True, "whether the figure has the photographs, whose licence may not allow to pass it on"
     )
     bodies: dict[str, RestingBodyConfig] = Field({}, description="bodies by name")
+    swings: dict[str, SwingConfig] = Field({}, description="released bodies by name")
+    cells: tuple[float, ...] = internal(
+        (0.01, 0.0075), "edge of a cell of the simulation of swings [m], with a result for each", min_length=1
+    )
 
     @model_validator(mode="after")
     def _agree(self) -> StillsConfig:
@@ -58,4 +73,9 @@ class StillsConfig(Section):
                 fitted = [key for key, other in self.bodies.items() if other.predicted_from is None]
                 problem = f"{source!r} is no body whose mu / rho is fitted{hint(source, fitted)}"
                 raise InputError(f"bodies.{name}.predicted_from", problem)
+        for name, swing in self.swings.items():
+            if swing.body not in self.bodies or self.bodies[swing.body].predicted_from:
+                fitted = [key for key, other in self.bodies.items() if other.predicted_from is None]
+                problem = f"{swing.body!r} is no body whose mu / rho is fitted{hint(swing.body, fitted)}"
+                raise InputError(f"swings.{name}.body", problem)
         return self

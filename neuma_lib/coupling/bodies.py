@@ -27,7 +27,9 @@ _AMBIENT = 0.45
 
 
 def join(bodies: Sequence[Reconstruction]) -> Reconstruction:
-    """Concatenate bodies: particles, Gaussians and bindings, in the given order."""
+    """Concatenate bodies: particles, Gaussians and bindings, in the given order. One body is returned unchanged."""
+    if len(bodies) == 1:
+        return bodies[0]
     offsets = np.cumsum([0, *(len(body.x0) for body in bodies)])
     entries = np.cumsum([0, *(len(body.binding.indices) for body in bodies)])
     bindings = [body.binding for body in bodies]
@@ -46,7 +48,7 @@ def join(bodies: Sequence[Reconstruction]) -> Reconstruction:
         **{name: torch.cat([getattr(g, name) for g in parts]) for name in names}, shN=torch.cat(padded)
     )
     x0, vol0, mass = (torch.cat([getattr(body, name) for body in bodies]) for name in ("x0", "vol0", "mass"))
-    return Reconstruction(x0, vol0, mass, gaussians, binding)
+    return Reconstruction(x0, vol0, mass, gaussians, binding, all(body.affine for body in bodies))
 
 
 def coloured_solid(mesh: trimesh.Trimesh, x0: Tensor, density: Density, colors: Tensor) -> Reconstruction:

@@ -16,7 +16,7 @@ from types import SimpleNamespace
 import torch
 import warp as wp
 
-from neuma_lib.device import native_source, start_warp
+from neuma_lib.device import native_source, start_warp, typed
 from neuma_lib.mechanics.singular_values_kernels import warp_types
 
 start_warp()
@@ -33,59 +33,53 @@ def frame_kernels(dtype: torch.dtype) -> SimpleNamespace:
     text = native_source(__file__, ".h")
     start = text["frames"].replace("REAL", {torch.float32: "float", torch.float64: "double"}[dtype])
 
-    @wp.func_native(start + text["forward"])
+    types = {
+        **dict.fromkeys(("frame", "count", "particles"), int),
+        "indptr": wp.array(dtype=int),  # rows of B, (G + 1,), in `backward` of B^T, (N + 1,)
+        "indices": wp.array(dtype=int),
+        "weights": wp.array(dtype=real),
+        "means": wp.array2d(dtype=real),  # (G, 3)
+        "covars": wp.array3d(dtype=real),  # (G, 3, 3)
+        "arms": wp.array2d(dtype=real),  # (G, 3) or None
+        "x0": wp.array2d(dtype=real),  # (N, 3)
+        "x": wp.array3d(dtype=real),  # (T, N, 3)
+        "F": wp.array4d(dtype=real),  # (T, N, 3, 3)
+        "scratch": wp.array2d(dtype=real),  # (N, 12); in `backward` (G, 12), or (G, 4) if F needs no gradient
+        "sums": wp.array3d(
+            dtype=real
+        ),  # (T, G, 12), out: mean shift and mean F of the particles; None without them
+        "moved": wp.array3d(dtype=real),  # (T, G, 3), out
+        "stretched": wp.array4d(dtype=real),  # (T, G, 3, 3), out
+        "grad_moved": wp.array3d(dtype=real),  # (T, G, 3)
+        "grad_stretched": wp.array4d(dtype=real),  # (T, G, 3, 3)
+        "grad_x": wp.array3d(dtype=real),  # (T, N, 3), out
+        "grad_F": wp.array4d(dtype=real),  # (T, N, 3, 3), out; None if F needs no gradient, as `sums` then
+    }
+    own = typed(types)
+    kernel = own.kernel(module)
+
+    @own.func_native(start + text["forward"])
     def forward_native(
-        frame: int, count: int, particles: int,
-        indptr: wp.array(dtype=int), indices: wp.array(dtype=int), weights: wp.array(dtype=real),
-        means: wp.array2d(dtype=real), covars: wp.array3d(dtype=real), arms: wp.array2d(dtype=real),
-        x0: wp.array2d(dtype=real), x: wp.array3d(dtype=real), F: wp.array4d(dtype=real),
-        scratch: wp.array2d(dtype=real), sums: wp.array3d(dtype=real),
-        moved: wp.array3d(dtype=real), stretched: wp.array4d(dtype=real),
+        frame, count, particles, indptr, indices, weights, means, covars, arms, x0, x, F, scratch, sums, moved,
+        stretched,
     ): ...  # fmt: skip
 
-    @wp.func_native(start + text["backward"])
+    @own.func_native(start + text["backward"])
     def backward_native(
-        frame: int, count: int, particles: int,
-        indptr: wp.array(dtype=int), indices: wp.array(dtype=int), weights: wp.array(dtype=real),
-        covars: wp.array3d(dtype=real), arms: wp.array2d(dtype=real), sums: wp.array3d(dtype=real),
-        grad_moved: wp.array3d(dtype=real), grad_stretched: wp.array4d(dtype=real), scratch: wp.array2d(dtype=real),
-        grad_x: wp.array3d(dtype=real), grad_F: wp.array4d(dtype=real),
+        frame, count, particles, indptr, indices, weights, covars, arms, sums, grad_moved, grad_stretched, scratch,
+        grad_x, grad_F,
     ): ...  # fmt: skip
 
-    @wp.kernel(enable_backward=False, module=module)
-    def forward(
-        indptr: wp.array(dtype=int),  # (G + 1,) rows of B
-        indices: wp.array(dtype=int),
-        weights: wp.array(dtype=real),
-        means: wp.array2d(dtype=real),  # (G, 3)
-        covars: wp.array3d(dtype=real),  # (G, 3, 3)
-        arms: wp.array2d(dtype=real),  # (G, 3) or None
-        x0: wp.array2d(dtype=real),  # (N, 3)
-        x: wp.array3d(dtype=real),  # (T, N, 3)
-        F: wp.array4d(dtype=real),  # (T, N, 3, 3)
-        scratch: wp.array2d(dtype=real),  # (N, 12)
-        sums: wp.array3d(dtype=real),  # (T, G, 12) or None, out: mean shift and mean F of the particles
-        moved: wp.array3d(dtype=real),  # (T, G, 3), out
-        stretched: wp.array4d(dtype=real),  # (T, G, 3, 3), out
-    ):
+    @kernel
+    def forward(indptr, indices, weights, means, covars, arms, x0, x, F, scratch, sums, moved, stretched):
         forward_native(
             wp.tid(), moved.shape[1], x0.shape[0], indptr, indices, weights, means, covars, arms, x0, x, F, scratch,
             sums, moved, stretched,
         )  # fmt: skip
 
-    @wp.kernel(enable_backward=False, module=module)
+    @kernel
     def backward(
-        indptr: wp.array(dtype=int),  # (N + 1,) rows of B^T
-        indices: wp.array(dtype=int),
-        weights: wp.array(dtype=real),
-        covars: wp.array3d(dtype=real),  # (G, 3, 3)
-        arms: wp.array2d(dtype=real),  # (G, 3) or None
-        sums: wp.array3d(dtype=real),  # (T, G, 12), result of `forward`; None if F needs no gradient
-        grad_moved: wp.array3d(dtype=real),  # (T, G, 3)
-        grad_stretched: wp.array4d(dtype=real),  # (T, G, 3, 3)
-        scratch: wp.array2d(dtype=real),  # (G, 12), (G, 4) if F needs no gradient
-        grad_x: wp.array3d(dtype=real),  # (T, N, 3), out
-        grad_F: wp.array4d(dtype=real),  # (T, N, 3, 3), out; None if F needs no gradient
+        indptr, indices, weights, covars, arms, sums, grad_moved, grad_stretched, scratch, grad_x, grad_F
     ):
         backward_native(
             wp.tid(), grad_moved.shape[1], grad_x.shape[1], indptr, indices, weights, covars, arms, sums, grad_moved,

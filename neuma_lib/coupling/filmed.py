@@ -34,7 +34,9 @@ class Filmed:
         self.renderer = renderer
         self._picture: Callable[..., Tensor] = renderer if compared == "colour" else renderer.coverage
         offsets, shares = observation.exposure, observation.shares
-        self._sharp = len(offsets) == 1 and compared == "colour" and isinstance(renderer, ParticleGS)
+        self._hidden, self._blank = observation.hidden, 1.0 if compared == "colour" else 0.0
+        whole = len(offsets) == 1 and self._hidden is None
+        self._sharp = whole and compared == "colour" and isinstance(renderer, ParticleGS)
         self.batch = max(1, renderer.frames_per_batch // len(offsets))
         self.error_batch = renderer.frames_per_error if self._sharp else self.batch
         index = {step: k for k, step in enumerate(steps)}
@@ -49,21 +51,31 @@ class Filmed:
         """Select the states of some frames, (T, ...) or (T, K, ...) for K exposed steps, from those at all steps."""
         return values[part] if self._rows is None else values[self._rows[part].to(values.device)]
 
-    def __call__(self, x: Tensor, F: Tensor) -> Tensor:
+    def __call__(self, x: Tensor, F: Tensor, part: slice = slice(None)) -> Tensor:
         """Images (T, V, H, W, C) of the `states` x (T, N, 3) [m] and F (T, N, 3, 3) of some frames.
 
-        C is 3 for colours in [0, 1], 1 for coverage. Images of K exposed steps, x (T, K, N, 3), are averaged.
+        C is 3 for colours in [0, 1], 1 for coverage. Images of K exposed steps, x (T, K, N, 3), are averaged. Pixels in
+        which another body hides this one are empty, as in the observation.
+
+        Args:
+            part: the frames, for an observation with hidden pixels.
         """
+        images = self._averaged(x, F)
+        if self._hidden is None:
+            return images
+        return images.masked_fill(self._hidden[part].to(images.device)[..., None], self._blank)
+
+    def _averaged(self, x: Tensor, F: Tensor) -> Tensor:
         if x.ndim == 3:
             return self._picture(x, F)
         instants = self._picture(x.flatten(0, 1), F.flatten(0, 1)).unflatten(0, x.shape[:2])
         return (instants * self._shares.to(instants).view(-1, *[1] * (instants.ndim - 2))).sum(1)
 
-    def error(self, x: Tensor, F: Tensor, seen: Tensor) -> Tensor:
+    def error(self, x: Tensor, F: Tensor, seen: Tensor, part: slice = slice(None)) -> Tensor:
         """Mean squared difference (T,) of each frame's images from the video ``seen`` (see `mean_squared_error`).
 
         Differentiable with respect to the states.
         """
         if self._sharp:
             return self.renderer.error(x, F, seen)
-        return mean_squared_error(self(x, F), seen)
+        return mean_squared_error(self(x, F, part), seen)

@@ -90,6 +90,7 @@ def evaluate(
     tracers: Tensor,
     total: bool = False,
     floor: Tensor | None = None,
+    owners: Tensor | None = None,
 ) -> Evaluation:
     """Tracer error from identical starts, Chamfer distance over the sequence, and its sampling floor.
 
@@ -103,6 +104,8 @@ def evaluate(
         tracers: start positions inside the reconstructed shape [m], shape (M', 3).
         total: also carry the total deformation.
         floor: Chamfer distances between the truth's two sets of points, shape (T,). None: computed here.
+        owners: body of each true tracer, shape (M,), for the tracer errors of each body in ``metrics["bodies"]``. None:
+            one body.
 
     Raises:
         InputError: counts of tracers that differ by more than `COUNT_TOLERANCE`. The floor holds for equal counts.
@@ -119,8 +122,12 @@ def evaluate(
     ours, same_start = path.tracers[:, : len(tracers)], path.tracers[:, len(tracers) :]
     chamfer = chamfer_sequence(ours, truth)
     floor = chamfer_sequence(truth_again, truth) if floor is None else floor
+    bodies = [] if owners is None else [owners == k for k in range(int(owners.max()) + 1)]
     metrics = {
         **tracer_errors(same_start, truth),
+        **(
+            {"bodies": [tracer_errors(same_start[:, own], truth[:, own]) for own in bodies]} if bodies else {}
+        ),
         "chamfer": float(chamfer.mean()),
         "chamfer_floor": float(floor.mean()),
         "chamfer_excess": float((chamfer - floor).mean()),

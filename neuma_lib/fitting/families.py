@@ -17,6 +17,7 @@ from neuma_lib.sim.model import MPM
 FRICTION = "contact_friction"
 """Name of the Coulomb coefficient of a body and its obstacles, a constant that belongs to no law."""
 _FRICTION_GUESS = 0.5
+_PAIR = "friction"  # name of the coefficient of a pair after those of its bodies
 _NO_FLOW = ("E", "nu", FRICTION)
 MAX_COURANT = 0.7
 """Largest Courant number of fitted constants. A correction may stiffen the law up to `catalogue.COURANT_LIMIT`."""
@@ -90,11 +91,14 @@ class Family:
 
     def unbounded(self, values: Values) -> np.ndarray:
         """Unbounded constants (k,): logarithms, or logits of constants with two bounds."""
-        return np.array([self._unbounded(key, values[key]) for key in self.constants])
+        return np.array([self.unbounded_of(key, values[key]) for key in self.constants])
 
     def values(self, unbounded: np.ndarray, model: MPM, density: float) -> Values:
         """Constants from unbounded ones, with E and the viscous part limited at a density [kg/m^3] by `MAX_COURANT`."""
-        values = self.bounded(unbounded)
+        return self.limited(self.bounded(unbounded), model, density)
+
+    def limited(self, values: Values, model: MPM, density: float) -> Values:
+        """Constants with E and the viscous part limited at a density [kg/m^3] by `MAX_COURANT`."""
         if self._viscous:
             number = model.courant(analytic_law(self.law_spec(values), model.dt), density)
             softer = min(1.0, (MAX_COURANT / number) ** 2)
@@ -108,7 +112,7 @@ class Family:
 
     def bounded(self, unbounded: np.ndarray) -> Values:
         """Constants from unbounded ones, without a limit on the stiffness."""
-        return {key: self._bounded(key, u) for key, u in zip(self.constants, unbounded, strict=True)}
+        return {key: self.bounded_of(key, u) for key, u in zip(self.constants, unbounded, strict=True)}
 
     def law_spec(self, values: Values) -> dict[str, dict[str, Any]]:
         """Specification of a law for `analytic_law`."""
@@ -117,6 +121,10 @@ class Family:
             if key != FRICTION:
                 spec[self._constants[key][0]][key] = value
         return spec
+
+    def pair_frictions(self, values: Values) -> list[float] | None:
+        """Coulomb coefficients of the pairs of bodies. None: one body."""
+        return None
 
     def unbounded_dict(self, values: Values, covariance: np.ndarray) -> dict[str, Any]:
         """Unbounded constants of the law with their covariance, for JSON: u = log(value - low) - log(high - value),
@@ -174,15 +182,102 @@ class Family:
         low, high = self._bounds(key)
         return low < value < high
 
-    def _unbounded(self, key: str, value: float) -> float:
+    def unbounded_of(self, key: str, value: float) -> float:
+        """Logarithm or logit of a constant."""
         low, high = self._bounds(key)
         if not low < value < high:
             where = f"identify.families.{self.name}.{key}"
             raise InputError(where, f"{value:g} must lie between {low:g} and {high:g}")
         return math.log(value - low) - (math.log(high - value) if math.isfinite(high) else 0.0)
 
-    def _bounded(self, key: str, u: float) -> float:
+    def bounded_of(self, key: str, u: float) -> float:
+        """Inverse of `unbounded_of`."""
         low, high = self._bounds(key)
         if math.isfinite(high):
             return low + (high - low) / (1 + math.exp(-min(max(u, -_MAX_LOGIT), _MAX_LOGIT)))
         return low + math.exp(u)
+
+
+class Bodies:
+    """A family for each of several bodies that touch each other, with the Coulomb coefficients of their pairs.
+
+    Attributes:
+        families: of each body.
+        constants: names of the constants to estimate in order, ``duck.E`` of a body and ``duck-ball.friction`` of a
+            pair.
+        guess: values of all constants, also of known ones.
+        contact_friction: False, since the obstacles have the friction of the scene.
+
+    Args:
+        families: by name of the body.
+        pairs: indices of the bodies of each pair.
+        known: constants that are not estimated.
+    """
+
+    contact_friction = False
+
+    def __init__(
+        self, families: Mapping[str, Family], pairs: Sequence[tuple[int, int]], known: Values | None = None
+    ):
+        self.families, self.bodies = list(families.values()), list(families)
+        self.name = ", ".join(f"{body} {family.name}" for body, family in families.items())
+        self._pairs = [f"{self.bodies[a]}-{self.bodies[b]}.{_PAIR}" for a, b in pairs]
+        self.guess: Values = {
+            f"{body}.{key}": value for body, family in families.items() for key, value in family.guess.items()
+        }
+        self.guess |= dict.fromkeys(self._pairs, _FRICTION_GUESS) | dict(known or {})
+        self.constants = tuple(key for key in self.guess if key not in (known or {}))
+
+    def of_body(self, k: int, values: Values) -> Values:
+        """The constants of a body under their own names."""
+        return {key: values[f"{self.bodies[k]}.{key}"] for key in self.families[k].constants}
+
+    def own(self, k: int) -> list[int]:
+        """Indices of the constants of a body among those to estimate."""
+        return [i for i, key in enumerate(self.constants) if key.startswith(f"{self.bodies[k]}.")]
+
+    @property
+    def pairs(self) -> dict[str, int]:
+        """Index of each friction to estimate, by name."""
+        return {key: i for i, key in enumerate(self.constants) if key in self._pairs}
+
+    def unbounded(self, values: Values) -> np.ndarray:
+        """As `Family.unbounded`, of the constants to estimate."""
+        return np.array([self._of(key).unbounded_of(_own(key), values[key]) for key in self.constants])
+
+    def bounded(self, unbounded: np.ndarray) -> Values:
+        """As `Family.bounded`, with the known constants."""
+        new = {
+            key: self._of(key).bounded_of(_own(key), u)
+            for key, u in zip(self.constants, unbounded, strict=True)
+        }
+        return self.guess | new
+
+    def values(self, unbounded: np.ndarray, model: MPM, density: float) -> Values:
+        """As `Family.values`."""
+        values = self.bounded(unbounded)
+        for k, (body, family) in enumerate(zip(self.bodies, self.families, strict=True)):
+            limited = family.limited(self.of_body(k, values), model, density)
+            values |= {f"{body}.{key}": value for key, value in limited.items()}
+        return values
+
+    def law_spec(self, values: Values) -> list[dict[str, dict[str, Any]]]:
+        """Specifications of the laws of all bodies."""
+        return [family.law_spec(self.of_body(k, values)) for k, family in enumerate(self.families)]
+
+    def pair_frictions(self, values: Values) -> list[float]:
+        """Coulomb coefficients of the pairs of bodies."""
+        return [values[key] for key in self._pairs]
+
+    def _of(self, key: str) -> Family:
+        """The family of a constant. A friction is transformed as that of any family with obstacles."""
+        return _OF_PAIRS if key in self._pairs else self.families[self.bodies.index(key.rpartition(".")[0])]
+
+
+def _own(key: str) -> str:
+    """Name of a constant in its family."""
+    name = key.rpartition(".")[2]
+    return FRICTION if name == _PAIR else name
+
+
+_OF_PAIRS = Family("pairs", {"elasticity": {"name": "hencky", **_GUESS}}, contact_friction=True)

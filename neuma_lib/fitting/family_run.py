@@ -1,4 +1,5 @@
-"""Fit of one family of laws to the frames of videos: residuals, Jacobian and uncertainty (used by `identify`)."""
+"""Fit of one family of laws, or one for each of several bodies, to the frames of videos: residuals, Jacobian and
+uncertainty (used by `identify` and `identify_bodies`)."""
 
 from __future__ import annotations
 
@@ -16,7 +17,7 @@ from torch import Tensor
 from neuma_lib.config.identify import IdentifyConfig
 from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.errors import NonFiniteError
-from neuma_lib.fitting.families import FRICTION, Family
+from neuma_lib.fitting.families import FRICTION, Bodies, Family
 from neuma_lib.fitting.identified import FamilyFit
 from neuma_lib.fitting.least_squares import (
     MIN_COST,
@@ -49,7 +50,7 @@ class FamilyRun:
 
     def __init__(
         self,
-        family: Family,
+        family: Family | Bodies,
         videos: Sequence[VideoResiduals],
         counts: Sequence[int],
         settings: IdentifyConfig,
@@ -61,7 +62,8 @@ class FamilyRun:
         self.fit: Linearisation | None = None
         self._constants = len(family.constants)
         self._origin, self._level = np.zeros(0), 0
-        self._u = np.zeros(self._constants + NUISANCES * len(videos))
+        self._firsts = np.cumsum([self._constants, *(video.deviations for video in videos)]).tolist()
+        self._u = np.zeros(self._firsts[-1])
         self._images: dict[bytes, list[Tensor] | None] = {}
         self._columns: dict[bytes, list[list[Tensor]]] = {}
         self._exact = True
@@ -168,8 +170,7 @@ class FamilyRun:
 
     def _own(self, v: int) -> list[int]:
         """Indices of the deviations of a video."""
-        first = self._constants + v * NUISANCES
-        return list(range(first, first + NUISANCES))
+        return list(range(*self._firsts[v : v + 2]))
 
     def _unsure(self, v: int) -> list[int]:
         """Indices of the deviations of a video that are not fixed to 0."""
@@ -263,7 +264,7 @@ class FamilyRun:
             covariance = self._covariance()
             result.covariance, stds = covariance[:k, :k], np.sqrt(np.diag(covariance))
             result.laplace = laplace(self.fit, self._spreads)[:k, :k]
-            result.motions = tuple(self._motion(v, stds) for v in range(len(self.videos)))
+            result.motions = tuple(each for v in range(len(self.videos)) for each in self._motions(v, stds))
             if any(count < len(video.frames) for count, video in zip(self.counts, self.videos, strict=True)):
                 result.held_out = self._held_out()
                 result.score = math.log(max(result.held_out, _MIN_LOSS)) + self.settings.penalty * k
@@ -389,10 +390,14 @@ class FamilyRun:
         own = zip(self._unsure(v), [each[k] for each in self.videos[v].by_deviation or ()], strict=False)
         return {i: column[:rows] for i, column in (*enumerate(c[at] for c in by_constants), *own)}
 
-    def _motion(self, v: int, stds: np.ndarray) -> InitialMotion:
-        """The fitted initial motion of a video, from the standard deviations of all unknowns."""
-        own, motion = self._own(v)[:MOTION], self.videos[v].motion
-        return replace(motion.moved(self._u[own]), std=motion.std * stds[own])
+    def _motions(self, v: int, stds: np.ndarray) -> list[InitialMotion]:
+        """The fitted initial motions of the bodies of a video, from the standard deviations of all unknowns."""
+        return [
+            replace(motion.moved(self._u[own]), std=motion.std * stds[own])
+            for motion, own in zip(
+                self.videos[v].motions, np.reshape(self._own(v), (-1, NUISANCES))[:, :MOTION], strict=True
+            )
+        ]
 
     def _constant_columns(self, unknowns: np.ndarray, residual: Sequence[Tensor]) -> list[list[Tensor]]:
         """Forward differences by the constants, or backward if the forward one diverges or exceeds the stiffness limit
@@ -427,7 +432,7 @@ class FamilyRun:
     @property
     def _spreads(self) -> np.ndarray:
         """Prior standard deviations of the unknowns about 0."""
-        deviations = np.ones(NUISANCES * len(self.videos))
+        deviations = np.ones(self._firsts[-1] - self._constants)
         return np.append(np.full(self._constants, self.settings.spread), deviations)
 
     def _prior(self, fit: Linearisation) -> np.ndarray:
@@ -442,7 +447,8 @@ class FamilyRun:
     def _candidate(self, unknowns: np.ndarray, v: int) -> Candidate:
         """The simulation of a video at unknowns."""
         values = self._values(unknowns)
-        return Candidate(self.family.law_spec(values), unknowns[self._own(v)], values.get(FRICTION))
+        law, pairs = self.family.law_spec(values), self.family.pair_frictions(values)
+        return Candidate(law, unknowns[self._own(v)], values.get(FRICTION), pairs)
 
     def _residual(self, unknowns: np.ndarray) -> list[Tensor] | None:
         key = unknowns.tobytes()

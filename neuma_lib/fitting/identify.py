@@ -151,7 +151,7 @@ def identify(
     if any(each.alive for each in fine.values()):
         compared = {name: each.score() for name, each in fine.items() if each.alive}
         _log_fits(compared.values(), " on the finer grid", log)
-    selected, ties = _select(list(compared.values()), settings)
+    selected, ties = select_family(list(compared.values()), settings)
     name = selected.family.name
     run = next(run for run in running if run.family is selected.family)
     starts, first = [run.values], rounds - 1
@@ -368,7 +368,7 @@ def _fitted_values(running: Sequence[FamilyRun], family: Family) -> list[Values]
     return [run.values for run in [*best, *(run for run in inner if len(run.family.constants) == size)]]
 
 
-def _select(fits: Sequence[FamilyFit], settings: IdentifyConfig) -> tuple[FamilyFit, list[str]]:
+def select_family(fits: Sequence[FamilyFit], settings: IdentifyConfig) -> tuple[FamilyFit, list[str]]:
     """The family with the lowest score, and the names of tied families.
 
     A family that contains the selected one is not tied, because its additional constants do not lower the score.

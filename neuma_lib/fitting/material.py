@@ -138,7 +138,7 @@ class PixelLoss:
 
         def losses(part: slice, x: Tensor, F: Tensor) -> Tensor:
             observed = video.stored(part) if self.compare == "colour" else video.coverage(part)
-            return filmed.error(x, F, observed)
+            return filmed.error(x, F, observed, part)
 
         states = (filmed.states(path.x), filmed.states(path.stretch))
         return evaluate_in_batches(losses, self.frames_per_batch or filmed.error_batch, *states)

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,15 +27,22 @@ from neuma_lib.geometry.outline import Outline, outline, silhouette
 from neuma_lib.io.datasets.stills import Still
 from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.clamps import Clamp
-from neuma_lib.sim.equilibrium import Equilibrium, solve_equilibrium
+from neuma_lib.sim.equilibrium import Equilibrium, clamped_nodes, solve_equilibrium
 from neuma_lib.sim.hexahedra import Hexahedra
 
 Array = NDArray[np.float64]
 GRAVITY = 9.81
 """[m/s^2]"""
-ROTATION, TRANSLATION, PLACEMENT, RATIO = slice(0, 3), slice(3, 6), slice(6, 9), 9
-"""Unknowns: changes of the camera's pose and of the placement, and of log(mu / rho)."""
-_SCALES = np.array([0.1, 0.1, 0.1, 0.01, 0.01, 0.01, 1.0, 1.0, 1.0, 0.1])  # of rad, m, (prior), 1
+ROTATION, TRANSLATION, PLACEMENT = slice(0, 3), slice(3, 6), slice(6, 9)
+RATIO, HELD, RELEASE = 9, 10, 11
+CENTRE = slice(12, 14)
+"""Unknowns: changes of the camera's pose and of the placement, of log(mu / rho), of the share of the weight that is
+held, of the time of release, and of the principal point of a second camera."""
+UNKNOWNS = 14
+_SCALES = np.array(
+    [0.1] * 3 + [0.01] * 3 + [1.0] * 3 + [0.1, 0.03, 5e-3, 5.0, 5.0]
+)  # rad, m, (prior), 1, 1, s, px
+_SHAPE = slice(9, 12)
 _CONTOUR_NOISE, _CORRELATED = (
     2.0,
     30.0,
@@ -43,6 +51,8 @@ _MARKER_NOISE = 0.5  # px
 _ROBUST = 4.0  # residual beyond which the cost grows linearly [px]
 _SPACING = 3.0  # of points of the observed silhouette [px]
 _HIDDEN_MARGIN = 4  # px around hidden parts, in which the silhouette is that of what hides them
+_UNKNOWN_MARGIN = 2  # px around unknown pixels, next to which a contour is theirs
+_MIN_CONTOUR, _MIN_POINTS = 40, 4  # points of a contour of a visible part, and of all
 _ROUNDS = 4  # after each of which points near hidden parts are chosen again
 _MAX_STEP = 3.0
 
@@ -53,25 +63,72 @@ def contours(mask: NDArray[np.bool_]) -> list[Array]:
     return [line[:, ::-1] - 0.5 for line in lines]  # padding, and half a pixel
 
 
-def contour(mask: NDArray[np.bool_]) -> Array:
+def contour(mask: NDArray[np.bool_], unknown: NDArray[np.bool_] | None = None) -> Array:
     """Points of the longest contour of a mask (H, W) at equal distances, shape (C, 2) [px].
 
+    Args:
+        unknown: pixels (H, W) that may show the body. The contours of all visible parts of the body are then used,
+            where they are not next to such pixels.
+
     Raises:
-        InputError: the mask is empty.
+        InputError: there is no contour.
     """
     lines = contours(mask)
     if not lines:
         raise InputError("mask", "shows no body")
-    line = max(lines, key=len)
-    reached = np.concatenate([[0], np.linalg.norm(np.diff(line, axis=0), axis=1).cumsum()])
-    count = max(4, round(reached[-1] / _SPACING))
-    sites = np.arange(count) * reached[-1] / count
-    return np.stack([np.interp(sites, reached, line[:, axis]) for axis in (0, 1)], axis=1)
+    lines = [max(lines, key=len)] if unknown is None else [line for line in lines if len(line) > _MIN_CONTOUR]
+    parts = []
+    for line in lines:
+        reached = np.concatenate([[0], np.linalg.norm(np.diff(line, axis=0), axis=1).cumsum()])
+        count = max(4, round(reached[-1] / _SPACING))
+        sites = np.arange(count) * reached[-1] / count
+        parts.append(np.stack([np.interp(sites, reached, line[:, axis]) for axis in (0, 1)], axis=1))
+    points = np.concatenate(parts) if parts else np.empty((0, 2))
+    if unknown is not None:
+        near = np.asarray(binary_dilation(unknown, iterations=_UNKNOWN_MARGIN), dtype=bool)
+        points = points[~_sampled(near, points)]
+    if len(points) < _MIN_POINTS:
+        raise InputError("mask", f"has {len(points)} points of a contour of the body, at least {_MIN_POINTS}")
+    return points
+
+
+def _sampled(mask: NDArray[np.bool_], points: Array) -> NDArray[np.bool_]:
+    """Values (C,) of a mask (H, W) at points (C, 2) [px], those of its border outside."""
+    columns, rows = np.floor(points).astype(int).T
+    return mask[rows.clip(0, len(mask) - 1), columns.clip(0, mask.shape[1] - 1)]
+
+
+class ClampedBody(Protocol):
+    """A body whose surface depends on three numbers: mu / rho [m^2/s^2], the share of its weight that is held before a
+    release, and the time of the release [s]."""
+
+    @property
+    def triangles(self) -> NDArray[np.int64]:
+        """Points of the triangles of the surface (T, 3)."""
+        ...
+
+    @property
+    def rotation(self) -> Array:
+        """From the body's frame to the marker's, shape (3, 3)."""
+        ...
+
+    @property
+    def hidden_points(self) -> NDArray[np.bool_]:
+        """Points of the surface that other objects hide (P,)."""
+        ...
+
+    def positions(self, shape: Array) -> Array:
+        """Points of the surface (P, 3) [m] in the body's frame."""
+        ...
+
+    def derivatives(self, shape: Array, free: Sequence[int]) -> Array:
+        """Their derivatives by log(mu / rho), share and time (3, P, 3). Those by others than ``free`` may be 0."""
+        ...
 
 
 @dataclass(eq=False)
 class RestingBody:
-    """A clamped body whose equilibrium depends on mu / rho.
+    """A clamped body whose equilibrium depends on mu / rho, and on the force that holds it.
 
     Attributes:
         body: the undeformed body in its own frame.
@@ -81,6 +138,8 @@ class RestingBody:
         rotation: from the body's frame to the marker's, shape (3, 3). Gravity is along -y of the marker's.
         hidden: box of the undeformed body behind another object, two corners, shape (2, 3) [m].
         surface_size: edge of the triangles of its surface [m].
+        held: box of the undeformed body with nodes that a force against gravity pulls, by their volumes, two corners,
+            shape (2, 3) [m]. Its unit is the weight of the part that is not clamped. None: nothing holds the body.
     """
 
     body: Hexahedra
@@ -90,7 +149,8 @@ class RestingBody:
     rotation: Array
     hidden: Array
     surface_size: float
-    _solved: dict[float, Equilibrium] = field(default_factory=dict)
+    held: Array | None = None
+    _solved: dict[tuple[float, float], Equilibrium] = field(default_factory=dict)
 
     def __post_init__(self):
         self.weights, self.triangles = self.body.surface(self.surface_size)
@@ -98,17 +158,56 @@ class RestingBody:
         low, high = self.hidden
         self.hidden_points = ((self.undeformed >= low) & (self.undeformed <= high)).all(axis=1)
 
-    def at_rest(self, ratio: float) -> Equilibrium:
-        """The equilibrium with mu / rho [m^2/s^2]; the last ones are kept."""
-        if ratio not in self._solved:
-            nearest = min(self._solved, key=lambda other: abs(math.log(other / ratio)), default=None)
+    def at_rest(self, ratio: float, share: float = 0.0) -> Equilibrium:
+        """The equilibrium with mu / rho [m^2/s^2] and a share of the weight that is held; the last ones are kept."""
+        key = ratio, share
+        if key not in self._solved:
+            nearest = min(
+                self._solved,
+                key=lambda other: abs(math.log(other[0] / ratio)) + abs(other[1] - share),
+                default=None,
+            )
             start = None if nearest is None else self._solved[nearest].x
-            gravity = -GRAVITY * self.rotation[1]
-            density = self.shear_modulus / ratio
-            self._solved[ratio] = solve_equilibrium(self.body, self.law, density, gravity, self.clamps, start)
+            forces = share * self.holding_forces(ratio) if share else None
+            self._solved[key] = solve_equilibrium(
+                self.body, self.law, self.shear_modulus / ratio, self.gravity, self.clamps, start, forces
+            )
             if len(self._solved) > 12:
                 self._solved.pop(next(iter(self._solved)))
-        return self._solved[ratio]
+        return self._solved[key]
+
+    @property
+    def gravity(self) -> Array:
+        """Acceleration in the body's frame [m/s^2], shape (3,)."""
+        return -GRAVITY * self.rotation[1]
+
+    def holding_forces(self, ratio: float) -> Array:
+        """Forces on the nodes (N, 3) [N] that hold the whole weight of the free part.
+
+        Raises:
+            InputError: no node that is free is in the box.
+        """
+        free = ~clamped_nodes(self.body, self.clamps)
+        slack = 1e-6 * np.ptp(self.body.nodes, axis=0).max()
+        inside = np.zeros(len(free), dtype=bool)
+        if self.held is not None:
+            low, high = self.held[0] - slack, self.held[1] + slack
+            inside = free & ((self.body.nodes >= low) & (self.body.nodes <= high)).all(axis=1)
+        if not inside.any():
+            raise InputError("held", "contains no node of the body that is free", "Give a region of the body")
+        volumes = self.body.node_volumes
+        shares = np.where(inside, volumes, 0.0) / volumes[inside].sum()
+        return -self.shear_modulus / ratio * volumes[free].sum() * shares[:, None] * self.gravity
+
+    def positions(self, shape: Array) -> Array:
+        return self.weights @ self.at_rest(*map(float, shape[:2])).x
+
+    def derivatives(self, shape: Array, free: Sequence[int]) -> Array:
+        ratio, share = map(float, shape[:2])
+        rest = self.at_rest(ratio, share)
+        held = rest.response(self.holding_forces(ratio)) if HELD in free else np.zeros_like(rest.x)
+        bends = (rest.by_stiffness, held, np.zeros_like(rest.x))
+        return np.stack([self.weights @ bend for bend in bends])
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,22 +217,24 @@ class StillFit:
     Attributes:
         pose: marker to camera, shape (4, 4).
         placement: origin of the body's frame in the marker's frame [m], shape (3,).
-        ratio: mu / rho [m^2/s^2].
-        log_std: standard deviation of its logarithm from noise and placement, with residuals of the silhouette that
-            are correlated over 30 px, and enlarged where they exceed the assumed noise; 0 if the ratio was given.
+        shape: mu / rho [m^2/s^2], the share of the weight that is held, and the time of release [s].
+        shape_std: standard deviations, of the first of its logarithm, from noise and placement, with residuals of the
+            silhouette that are correlated over 30 px, and enlarged where they exceed the assumed noise; 0 if given.
+        centre: change of the principal point [px].
         placement_std: of the placement [m], shape (3,).
         contour_rms: root mean square distance of the visible observed silhouette from the outline [px].
         marker_rms: of the marker's corners [px].
         iou: intersection over union of masks where the body is not hidden.
-        cost: weighted sum of squares with the prior's.
+        cost: weighted sum of squares with the prior's, of all stills that were fitted together.
         predicted: mask of the body in equilibrium, hidden parts included, shape (H, W).
         hidden: pixels of hidden parts, which are not compared, shape (H, W).
     """
 
     pose: Array
     placement: Array
-    ratio: float
-    log_std: float
+    shape: tuple[float, float, float]
+    shape_std: tuple[float, float, float]
+    centre: tuple[float, float]
     placement_std: Array
     contour_rms: float
     marker_rms: float
@@ -142,58 +243,79 @@ class StillFit:
     predicted: NDArray[np.bool_]
     hidden: NDArray[np.bool_]
 
+    @property
+    def ratio(self) -> float:
+        """mu / rho [m^2/s^2]."""
+        return self.shape[0]
+
+    @property
+    def log_std(self) -> float:
+        """Standard deviation of its logarithm."""
+        return self.shape_std[0]
+
 
 class StillResiduals:
     """Residuals of a still in units of standard deviations, for `levenberg_marquardt`.
 
-    Unknowns u (10,) are changes in units of `_SCALES`: of the camera's rotation and translation, of the placement in
-    standard deviations of its prior, and of log(mu / rho).
+    Unknowns u (14,) are changes in units of `_SCALES`: of the camera's rotation and translation, of the placement in
+    standard deviations of its prior, of the numbers of the body's shape, and of the principal point.
+
+    Args:
+        still: with the pose of its camera in the frame of the first.
+        body: the body, whose surface depends on the numbers of its shape.
+        pose: marker to the first camera.
+        shape: mu / rho [m^2/s^2], and the other numbers of the shape, 0 if they are not given.
+        centre: change of the principal point [px]. None: the given one is exact.
     """
 
     def __init__(
         self,
         still: Still,
-        body: RestingBody,
+        body: ClampedBody,
         pose: Array,
         placement: Array,
         placement_std: float,
-        ratio: float,
+        *shape: float,
+        centre: tuple[float, float] | None = None,
     ):
         self.still, self.body = still, body
-        self.start = pose, placement, ratio
-        self.scales = _SCALES * np.where(np.arange(10) // 3 == 2, placement_std, 1.0)
-        self.scales[RATIO] = _SCALES[RATIO]
-        self.contour = contour(still.mask)
-        step = np.linalg.norm(self.contour[1] - self.contour[0])
+        self.start = pose, placement, np.array([*shape, 0.0, 0.0][:3]), np.array(centre or (0.0, 0.0))
+        self.scales = _SCALES.copy()
+        self.scales[PLACEMENT] *= placement_std
+        self.scales[CENTRE] *= centre is not None
+        self.contour = contour(still.mask, still.unknown)
+        step = np.median(np.linalg.norm(np.diff(self.contour, axis=0), axis=1))
         self.weight = math.sqrt(step / _CORRELATED) / _CONTOUR_NOISE
         self.visible = np.ones(len(self.contour), dtype=bool)
 
-    def values(self, u: Array) -> tuple[Array, Array, float]:
-        """Pose (4, 4), placement (3,) and ratio of unknowns."""
-        pose, placement, ratio = self.start
+    def values(self, u: Array) -> tuple[Array, Array, Array, Array]:
+        """Pose (4, 4), placement (3,), numbers of the shape (3,) and change of the principal point (2,) of unknowns."""
+        pose, placement, shape, centre = self.start
         change = self.scales * u
         pose = pose.copy()
         pose[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec(change[ROTATION]).as_matrix()
         pose[:3, 3] += change[TRANSLATION]
-        return pose, placement + change[PLACEMENT], float(ratio * np.exp(change[RATIO]))
+        shape = np.array([shape[0] * np.exp(change[RATIO]), *(shape + change[_SHAPE])[1:]])
+        return pose, placement + change[PLACEMENT], shape, centre + change[CENTRE]
 
-    def _project(self, pose: Array, points: Array) -> tuple[Array, Array]:
+    def _project(self, u: Array, points: Array) -> tuple[Array, Array]:
         """Pixels (P, 2) of points (P, 3) in the marker's frame, and derivatives by their positions there (P, 2, 3)."""
-        local = points @ pose[:3, :3].T + pose[:3, 3]
+        pose, _, _, centre = self.values(u)
+        seen = self.still.camera @ pose
+        local = points @ seen[:3, :3].T + seen[:3, 3]
         z = local[:, 2:]
         if not (z > 0).all():
             raise NonFiniteError("still", "the body is behind the camera")
         image = local @ self.still.K.T
         pixels = image[:, :2] / z
         slopes = (self.still.K[:2] - pixels[:, :, None] * self.still.K[2]) / z[..., None]
-        return pixels, slopes @ pose[:3, :3]
+        return pixels + centre, slopes @ seen[:3, :3]
 
     def surface(self, u: Array) -> tuple[Array, Array, Array]:
         """Positions of the surface in the marker's frame (P, 3), pixels (P, 2) and `_project`'s derivatives."""
-        pose, placement, ratio = self.values(u)
-        x = self.body.weights @ self.body.at_rest(ratio).x
-        points = x @ self.body.rotation.T + placement
-        return points, *self._project(pose, points)
+        _, placement, shape, _ = self.values(u)
+        points = self.body.positions(shape) @ self.body.rotation.T + placement
+        return points, *self._project(u, points)
 
     def _distances(self, pixels: Array) -> tuple[Outline, NDArray[np.int64], Array, Array]:
         edge = outline(pixels, self.body.triangles)
@@ -205,9 +327,7 @@ class StillResiduals:
         pixels = self.surface(u)[1]
         edge, segment, _, _ = self._distances(pixels)
         visible = ~self.body.hidden_points[edge.vertices[segment]].any(axis=1)
-        behind = self.hidden(pixels, _HIDDEN_MARGIN)
-        columns, rows = np.floor(self.contour).astype(int).T
-        visible &= ~behind[rows.clip(0, len(behind) - 1), columns.clip(0, behind.shape[1] - 1)]
+        visible &= ~_sampled(self.hidden(pixels, _HIDDEN_MARGIN), self.contour)
         changed, self.visible = bool((visible != self.visible).any()), visible
         return changed
 
@@ -222,23 +342,23 @@ class StillResiduals:
         return np.linalg.norm(self._distances(self.surface(u)[1])[3], axis=1)
 
     def _corners(self, u: Array) -> tuple[Array, Array]:
-        """Residuals of the marker's corners (2 M,) and their derivatives by the unknowns (2 M, 10)."""
-        pose = self.values(u)[0]
-        pixels, slopes = self._project(pose, self.still.marker)
-        J = np.zeros((2 * len(pixels), 10))
-        self._by_pose(J, u, self.still.marker, slopes.reshape(-1, 3), pose)
+        """Residuals of the marker's corners (2 M,) and their derivatives by the unknowns (2 M, 14)."""
+        pixels, slopes = self._project(u, self.still.marker)
+        J = np.zeros((2 * len(pixels), UNKNOWNS))
+        self._by_pose(J, u, self.still.marker, slopes.reshape(-1, 3))
+        J.reshape(-1, 2, UNKNOWNS)[:, (0, 1), (12, 13)] = self.scales[CENTRE]
         return (pixels - self.still.marker_pixels).ravel() / _MARKER_NOISE, J / _MARKER_NOISE
 
-    def _by_pose(self, J: Array, u: Array, points: Array, slopes: Array, pose: Array) -> None:
+    def _by_pose(self, J: Array, u: Array, points: Array, slopes: Array) -> None:
         """Write derivatives by the pose of rows whose derivatives by the position in the marker's frame are given."""
-        rows = len(slopes) // len(points)
+        rows = len(slopes) // max(1, len(points))
         turned = Rotation.from_rotvec((self.scales * u)[ROTATION])
         jacobian = _right_jacobian(turned.as_rotvec())
         moved = np.cross(np.repeat(points, rows, axis=0), slopes)  # s . (w x p) = w . (p x s)
         J[:, ROTATION] = moved @ jacobian * self.scales[ROTATION]
-        J[:, TRANSLATION] = slopes @ pose[:3, :3].T * self.scales[TRANSLATION]
+        J[:, TRANSLATION] = slopes @ self.values(u)[0][:3, :3].T * self.scales[TRANSLATION]
 
-    def _evaluate(self, u: Array) -> tuple[Array, Array]:
+    def _evaluate(self, u: Array, free: Sequence[int]) -> tuple[Array, Array]:
         """Robust residuals in units of standard deviations and their derivatives: silhouette, then marker."""
         points, pixels, slopes = self.surface(u)
         edge, segment, share, offsets = self._distances(pixels)
@@ -250,17 +370,17 @@ class StillResiduals:
             direction[flat] = (
                 np.stack([-along[:, 1], along[:, 0]], axis=1) / np.linalg.norm(along, axis=1)[:, None]
             )
-        pose, _, ratio = self.values(u)
-        J = np.zeros((len(self.contour), 10))
-        bend = self.body.weights @ self.body.at_rest(ratio).by_stiffness @ self.body.rotation.T
+        J = np.zeros((len(self.contour), UNKNOWNS))
+        bends = self.body.derivatives(self.values(u)[2], free) @ self.body.rotation.T
         for end, weight in ((0, 1 - share), (1, share)):
             vertex = edge.vertices[segment, end]
             own = weight[:, None] * np.einsum("qi,qij->qj", direction, slopes[vertex])
             part = np.zeros_like(J)
-            self._by_pose(part, u, points[vertex], own, pose)
+            self._by_pose(part, u, points[vertex], own)
             part[:, PLACEMENT] = own * self.scales[PLACEMENT]
-            part[:, RATIO] = (own * bend[vertex]).sum(axis=1) * self.scales[RATIO]
+            part[:, _SHAPE] = np.einsum("qi,kqi->qk", own, bends[:, vertex]) * self.scales[_SHAPE]
             J += part
+        J[:, CENTRE] = direction * self.scales[CENTRE]
         # Huber's cost as a square: its root, with that root's derivative
         far = np.maximum(distance, _ROBUST)
         root = np.where(distance > _ROBUST, np.sqrt(_ROBUST * (2 * far - _ROBUST)), distance)
@@ -271,14 +391,14 @@ class StillResiduals:
 
     def cost(self, unknowns: Array) -> float:
         try:
-            residual = self._evaluate(unknowns)[0]
+            residual = self._evaluate(unknowns, ())[0]
         except NonFiniteError:
             return math.inf
         return float(residual @ residual)
 
     def linearise(self, unknowns: Array, free: Sequence[int], exact: bool = True) -> Linearisation:
-        residual, J = self._evaluate(unknowns)
-        J[:, np.setdiff1d(np.arange(10), free)] = 0
+        residual, J = self._evaluate(unknowns, free)
+        J[:, np.setdiff1d(np.arange(UNKNOWNS), free)] = 0
         rms = float(np.sqrt((residual**2).mean()))
         return Linearisation((J.T @ J)[None], (J.T @ residual)[None], float(residual @ residual), rms)
 
@@ -316,58 +436,91 @@ def fit_still(
         InputError: the mask is empty.
         NonFiniteError: no pose leads to a finite fit.
     """
-    free = [k for k in range(10) if k != RATIO or not fixed_ratio]
-    fits: list[tuple[StillResiduals, Array, Linearisation]] = []
-    for pose in poses:
-        residuals = StillResiduals(still, body, pose, placement, placement_std, ratio)
-        if math.isfinite(residuals.cost(np.zeros(10))):
-            fits.append((residuals, *_minimise(residuals, free, iterations)))
+    free = [*range(9)] if fixed_ratio else [*range(9), RATIO]
+    problems = [
+        Stills([StillResiduals(still, body, pose, placement, placement_std, ratio)]) for pose in poses
+    ]
+    fits = [
+        (problem, *problem.minimise(np.zeros(UNKNOWNS), free, iterations))
+        for problem in problems
+        if math.isfinite(problem.cost(np.zeros(UNKNOWNS)))
+    ]
     if not fits:
         raise NonFiniteError("still", "no initial pose shows the body in front of the camera")
-    costs = [float(fit.cost + u @ _prior(fit) @ u) for _, u, fit in fits]
-    best = int(np.argmin(costs))
-    return _result(free, costs[best], *fits[best])
+    problem, u, fit = min(fits, key=lambda each: total_cost(*each[1:]))
+    return problem.results(u, fit, free)[0]
 
 
-def _minimise(residuals: StillResiduals, free: Sequence[int], iterations: int) -> tuple[Array, Linearisation]:
-    """Unknowns and the problem linearised there, with the points of the silhouette that are visible there."""
-    u: Array = np.zeros(10)
-    for attempt in range(_ROUNDS):
-        if not residuals.choose_visible(u) and attempt:
-            break
-        u, _, _ = levenberg_marquardt(residuals, u, free, _prior, 1e-5, iterations, longest=_MAX_STEP)
-    return u, residuals.linearise(u, free)
+class Stills:
+    """Stills that share all unknowns, for `levenberg_marquardt`."""
+
+    def __init__(self, parts: Sequence[StillResiduals]):
+        self.parts = parts
+
+    def cost(self, unknowns: Array) -> float:
+        return sum(part.cost(unknowns) for part in self.parts)
+
+    def linearise(self, unknowns: Array, free: Sequence[int], exact: bool = True) -> Linearisation:
+        parts = [part.linearise(unknowns, free) for part in self.parts]
+        curvatures, scores = (
+            np.stack([getattr(part, key) for part in parts]) for key in ("curvature", "slope")
+        )
+        rms = float(np.sqrt(np.mean([part.rms**2 for part in parts])))
+        return Linearisation(curvatures, scores, sum(part.cost for part in parts), rms)
+
+    def minimise(
+        self, start: Array, free: Sequence[int], iterations: int, min_gain: float = 1e-5
+    ) -> tuple[Array, Linearisation]:
+        """Unknowns and the problem linearised there, with the points of the silhouettes that are visible there."""
+        u = start
+        for attempt in range(_ROUNDS):
+            changed = [part.choose_visible(u) for part in self.parts]
+            if not any(changed) and attempt:
+                break
+            u, _, _ = levenberg_marquardt(self, u, free, _prior, min_gain, iterations, longest=_MAX_STEP)
+        return u, self.linearise(u, free)
+
+    def results(self, u: Array, fit: Linearisation, free: Sequence[int]) -> list[StillFit]:
+        """A result for each still."""
+        inner, cost = np.ix_(free, free), total_cost(u, fit)
+        covariance = np.zeros((UNKNOWNS, UNKNOWNS))
+        covariance[inner] = np.linalg.inv((fit.curvature + _prior(fit))[inner])
+        independent = sum(
+            part.visible.sum() * (part.weight * _CONTOUR_NOISE) ** 2 + 2 * len(part.still.marker)
+            for part in self.parts
+        )
+        misfit = max(1.0, cost / max(1.0, independent - len(free) + 3))  # the prior adds three values
+        deviations = np.sqrt(misfit * np.diag(covariance))
+        return [_result(part, u, deviations, cost) for part in self.parts]
+
+
+def total_cost(u: Array, fit: Linearisation) -> float:
+    """Sum of squares with those of the prior."""
+    return float(fit.cost + u @ _prior(fit) @ u)
 
 
 def _prior(fit: Linearisation) -> Array:
     """Curvature of the prior: 1 of the placement, and next to nothing of others."""
-    P = np.full(10, 1e-9)
+    P = np.full(UNKNOWNS, 1e-9)
     P[PLACEMENT] = 1.0
     return np.diag(P)
 
 
-def _result(
-    free: Sequence[int], cost: float, residuals: StillResiduals, u: Array, fit: Linearisation
-) -> StillFit:
+def _result(residuals: StillResiduals, u: Array, deviations: Array, cost: float) -> StillFit:
     still, body = residuals.still, residuals.body
-    pose, placement, ratio = residuals.values(u)
-    inner = np.ix_(free, free)
-    covariance = np.zeros((10, 10))
-    covariance[inner] = np.linalg.inv((fit.curvature + _prior(fit))[inner])
-    independent = residuals.visible.sum() * (residuals.weight * _CONTOUR_NOISE) ** 2 + 2 * len(still.marker)
-    misfit = max(1.0, cost / max(1.0, independent - len(free) + 3))  # the prior adds three values
-    std = np.asarray(residuals.scales * np.sqrt(misfit * np.diag(covariance)), dtype=np.float64)
+    pose, placement, shape, centre = residuals.values(u)
+    std = residuals.scales * deviations
     distance = residuals.distances(u)[residuals.visible]
     corners = residuals._corners(u)[0] * _MARKER_NOISE
     _, pixels, _ = residuals.surface(u)
     height, width = still.mask.shape
     predicted = silhouette(pixels, body.triangles, height, width)
     hidden = residuals.hidden(pixels, _HIDDEN_MARGIN)
-    compared = ~hidden
+    compared = ~hidden if still.unknown is None else ~(hidden | still.unknown)
     union = ((predicted | still.mask) & compared).sum()
     iou = ((predicted & still.mask) & compared).sum() / max(1, union)
     return StillFit(
-        pose, placement, ratio, float(std[RATIO]), std[PLACEMENT],
-        float(np.sqrt((distance**2).mean())), float(np.sqrt((corners**2).mean() * 2)), float(iou), cost,
-        predicted, hidden,
+        pose, placement, tuple(shape.tolist()), tuple(std[_SHAPE].tolist()), tuple(centre.tolist()), std[PLACEMENT],
+        float(np.sqrt((distance**2).mean())), float(np.sqrt((corners**2).mean() * 2)) if len(corners) else 0.0,
+        float(iou), cost, predicted, hidden,
     )  # fmt: skip

@@ -27,29 +27,38 @@ SURFACE = 0.005
 """Edge of the triangles of the surface [m]. On a beam that bends with a radius of 10 cm, chords are 0.03 mm inside."""
 FIRST_RATIO = 60.0
 """mu / rho before the fit [m^2/s^2]. Fits from 30 to 200 end at the same value."""
-_MODULUS = 100.0  # any: only its ratio to the density matters
+_MODULUS = 100.0  # Pa
+
+
+def resting_law(nu: float) -> dict[str, dict[str, float | str]]:
+    """The law of bodies at rest, with any modulus, since only its ratio to the density matters."""
+    return {"elasticity": {"name": "neo_hookean", "E": 2 * _MODULUS * (1 + nu), "nu": nu}}
 
 
 def resting_body(
-    mesh: trimesh.Trimesh, settings: RestingBodyConfig, clamp: RegionConfig, size: float
+    mesh: trimesh.Trimesh,
+    settings: RestingBodyConfig,
+    clamp: RegionConfig,
+    size: float,
+    held: RegionConfig | None = None,
 ) -> RestingBody:
     """A body with elements of a size [m], held in one of its clamps.
 
     Args:
         mesh: surface in the unit of the file.
+        held: region that a force holds before a release.
     """
     scaled = mesh.copy()
     scaled.apply_scale(settings.unit)
-    held = Clamp(clamp.lowest, clamp.highest)
-    law = {"name": "neo_hookean", "E": 2 * _MODULUS * (1 + settings.nu), "nu": settings.nu}
     return RestingBody(
         hexahedra(scaled, size, [clamp.lowest, clamp.highest]),
-        Law.from_spec({"elasticity": law}),
+        Law.from_spec(resting_law(settings.nu)),
         _MODULUS,
-        [held],
+        [Clamp(clamp.lowest, clamp.highest)],
         Rotation.from_rotvec(settings.rotation).as_matrix(),
         np.array([settings.hidden.lowest, settings.hidden.highest]),
         SURFACE,
+        None if held is None else np.array([held.lowest, held.highest]),
     )
 
 

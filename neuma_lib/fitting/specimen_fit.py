@@ -23,12 +23,11 @@ from scipy.optimize import least_squares
 from neuma_lib.config.specimens import SpecimenConfig
 from neuma_lib.coupling.interpolation import Interpolation
 from neuma_lib.coupling.markers import MarkerTracks
-from neuma_lib.coupling.specimens import Beam, Specimen, clamped_beam
+from neuma_lib.coupling.specimens import Beam, Specimen, clamped_beam, released
 from neuma_lib.fitting.families import Family
 from neuma_lib.fitting.vibration import Vibration, fit_vibration
 from neuma_lib.mechanics.combinations import Values
 from neuma_lib.mechanics.law import Law
-from neuma_lib.sim.rollout import rollout
 
 FRAME = 2.5e-3
 """Interval of simulated frames [s], between which a cubic spline interpolates."""
@@ -298,19 +297,12 @@ class _Motion:
 
 def _simulated(specimen: Specimen, law: Law, duration: float):
     """The motion of markers at places (M, 3) of the beam [m], as a function of places and then of times."""
-    stride = max(1, int(FRAME / specimen.model.dt))
-    steps = stride * (int(duration / specimen.model.dt / stride) + 2)
-    frames = range(0, steps + 1, stride)
-    with torch.no_grad():
-        path = rollout(
-            specimen.model, law, specimen.start, steps=steps, frames=frames, skip_free_flight=False
-        )
-    times = specimen.model.dt * np.array(frames)
-    x = specimen.to_world(path.x.double())
-    x = x[:, x[0, :, 0] > _END * x[0, :, 0].max()]
+    times, x = released(specimen, law, duration, FRAME)
+    outer = specimen.places[:, 0] > _END * specimen.places[:, 0].max()
+    x, anchors = x[:, outer], specimen.places[outer]
 
     def of_markers(places: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-        moved, _ = Interpolation(torch.from_numpy(places), x[0], _NEIGHBOURS)(x)
+        moved, _ = Interpolation(torch.from_numpy(places), anchors, _NEIGHBOURS)(x)
         return CubicSpline(times, moved.numpy())
 
     return of_markers

@@ -27,18 +27,23 @@ from functools import partial
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from neuma_lib.config.velocity import VelocityConfig
 from neuma_lib.coupling.filmed import Filmed
+from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.fitting.frame_batches import frame_batches, spread_frames
 from neuma_lib.fitting.least_squares import Linearisation, block_sums, jackknife, levenberg_marquardt
 from neuma_lib.mechanics.law import Law
+from neuma_lib.sim.body_contact import REACH
+from neuma_lib.sim.colliders import contact_radius
 from neuma_lib.sim.model import MPM, contact_clearance
+from neuma_lib.sim.rigid_flight import rigid_flight
 from neuma_lib.sim.rollout import rollout
-from neuma_lib.sim.state import cross_matrix
+from neuma_lib.sim.state import State, cross_matrix
 from neuma_lib.splatting.observation import (
     Observation,
     joint_frames,
@@ -56,6 +61,7 @@ _ALL, _NO_SPIN = list(range(UNKNOWNS)), [0, 1, 2, 6, 7, 8]  # free unknowns with
 _ROUNDS = 10  # maximum number of sets of frames and of simulations of a spinning body
 _MIN_GAIN = 1e-5  # relative decrease of the cost at convergence, a hundredth of the uncertainty
 _ROUGH_GAIN = 1e-3  # the same before all frames are used
+_CONTACT_ROUNDS = 2  # estimates of several bodies from the frames before their predicted contacts
 _MIN_TURN = 5e-3  # angle by which a change of the spin requires another simulation [rad]
 
 
@@ -155,6 +161,7 @@ def estimate_velocity(
     observation: Observation | Sequence[Observation],
     settings: VelocityConfig,
     progress: Callable[[int, int, float], None] | None = None,
+    others: Sequence[State] = (),
 ) -> VelocityEstimate:
     """Estimate the initial velocity and spin of a body from the frames before its first contact.
 
@@ -168,6 +175,7 @@ def estimate_velocity(
             from the contact on are ignored.
         settings: hyper-parameters, with the ``views`` of the observation.
         progress: called with (step, steps, loss).
+        others: initial states of other bodies in free flight, with which contact counts as well.
 
     Raises:
         InputError: fewer than two frames, or the body touches a wall in the first frame.
@@ -185,7 +193,7 @@ def estimate_velocity(
             "frames", "the body touches a wall in the first frame", "Start the video before the contact"
         )
     ends = tuple(max(n + video.exposure[-1] for video in videos if n in video.frames) for n in frames)
-    flight = _Flight(model, law, body, ends)
+    flight = _Flight(model, law, body, ends, others)
     minimise = partial(_minimise, axes=axes, settings=settings, progress=progress)
     unknowns, accepted = np.zeros(UNKNOWNS), 0
     used = min(settings.initial_frames, len(frames))
@@ -235,6 +243,41 @@ def estimate_velocity(
     )
 
 
+def estimate_velocities(
+    model: MPM,
+    law: Law,
+    bodies: Sequence[Reconstruction],
+    videos: Sequence[Sequence[Observation]],
+    settings: VelocityConfig,
+    progress: Callable[[int, int, float], None] | None = None,
+) -> list[VelocityEstimate]:
+    """`estimate_velocity` of each of several bodies, which also touch each other.
+
+    When they do follows from the motion of all. It is estimated from the first frames alone, and then from those before
+    the contacts that the last estimates predict.
+
+    Args:
+        bodies: reconstructed particles and Gaussians of each body.
+        videos: of each body, with the pixels that other bodies hide (`Observation.hidden`).
+    """
+    model = replace(model, pairs=())  # bodies that fly are simulated alone
+    first = [select_frames(own, joint_frames(own)[: settings.initial_frames]) for own in videos]
+    pairs = zip(bodies, first, strict=True)
+    estimates = [estimate_velocity(model, law, body, own, settings) for body, own in pairs]
+    total = _CONTACT_ROUNDS * len(bodies)
+    for done in range(total):
+        k = done % len(bodies)
+        states = [
+            InitialMotion.of(each.as_dict()).of_body(body)
+            for each, body in zip(estimates, bodies, strict=True)
+        ]
+        others = [*states[:k], *states[k + 1 :]]
+        estimates[k] = estimate_velocity(model, law, bodies[k], videos[k], settings, others=others)
+        if progress:
+            progress(done + 1, total, estimates[k].loss)
+    return estimates
+
+
 class _Flight:
     """Free flight of the body: the simulated motion of a spinning body, moved along a parabola.
 
@@ -248,8 +291,11 @@ class _Flight:
             velocity of 1 m/s about the centre, `NUISANCE_SCALE`, 1 and 1.
     """
 
-    def __init__(self, model: MPM, law: Law, body: Reconstruction, ends: tuple[int, ...]):
+    def __init__(
+        self, model: MPM, law: Law, body: Reconstruction, ends: tuple[int, ...], others: Sequence[State] = ()
+    ):
         self.model, self.law, self.body, self.ends = model, law, body, ends
+        self._others = [(rigid_flight(model, state, ends).x, state.vol0) for state in others]
         self.centre = body.mass @ body.x0 / body.mass.sum()
         gyration = ((body.x0 - self.centre).square().sum(1) @ body.mass / body.mass.sum()).sqrt()
         self.units = np.append(np.repeat([1.0, 1.0 / float(gyration), NUISANCE_SCALE], 3), [1.0, 1.0])
@@ -308,10 +354,19 @@ class _Flight:
         return x + self.centre + n * dt * v0 + g * dt**2 * n * (n + 1) / 2, F
 
     def frames_before_contact(self, unknowns: np.ndarray, count: int) -> int:
-        """Number of the first `count` frames that end before the body touches a wall."""
+        """Number of the first `count` frames that end before the body touches a wall or another body."""
         x, _ = self(*self.motion(unknowns), self.ends[:count])
         touching = contact_clearance(self.model, x, self.body.vol0, self.ends[:count]) <= 0
+        reach = REACH * self.model.dx + contact_radius(self.body.vol0).max()
+        for other, vol0 in self._others:
+            gaps = (_distance(own, at) for own, at in zip(x, other, strict=False))
+            touching |= torch.stack([*gaps]) <= reach + contact_radius(vol0).max()
         return int(touching.int().argmax()) if touching.any() else len(x)
+
+
+def _distance(a: Tensor, b: Tensor) -> Tensor:
+    """Smallest distance [m] between points (N, 3) and (M, 3) [m]."""
+    return torch.as_tensor(cKDTree(a.cpu().numpy()).query(b.cpu().numpy())[0].min()).to(a)
 
 
 @dataclass
@@ -381,7 +436,7 @@ class _Residuals:
             F = (1 + enlargement) * F
             if exposed > 1:
                 x, F = (state.unflatten(0, (-1, exposed)) for state in (x, F))
-            return self._filmed[video](x, F)
+            return self._filmed[video](x, F, part)
 
     def _checked(self, cost: Tensor, unknowns: np.ndarray) -> float:
         value = float(cost)

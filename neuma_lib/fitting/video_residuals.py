@@ -1,8 +1,9 @@
-"""Residuals between simulated and observed images of a launched body, from which constants are identified.
+"""Residuals between simulated and observed images of launched bodies, from which constants are identified.
 
-A candidate is a law with deviations of the initial motion and of the position of the rendered body from their
-estimates. A coarse grid and few particles change the apparent material, so a second discretisation, with a finer grid,
-shorter time steps and more particles, may be simulated instead.
+A candidate is a law of each body with deviations of its initial motion and of the position of the rendered body from
+their estimates. Several bodies touch each other with frictions of their pairs. A coarse grid and few particles change
+the apparent material, so a second discretisation, with a finer grid, shorter time steps and more particles, may be
+simulated instead.
 """
 
 from __future__ import annotations
@@ -18,10 +19,11 @@ import torch
 from torch import Tensor
 
 from neuma_lib.config.identify import IdentifyConfig
+from neuma_lib.coupling.bodies import join
 from neuma_lib.coupling.filmed import Filmed
 from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.coupling.reconstruction import Reconstruction
-from neuma_lib.fitting.families import Family
+from neuma_lib.fitting.families import Bodies, Family
 from neuma_lib.fitting.frame_batches import first_contact, frame_batches, held_out_frames, spread_frames
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.law import Law
@@ -35,7 +37,7 @@ from neuma_lib.threads import in_threads
 MOTION = 6
 """Number of unknowns of an initial motion: velocity and spin."""
 NUISANCES = 9
-"""`MOTION`, and shift right, shift down and enlargement of the rendered body."""
+"""`MOTION`, and shift right, shift down and enlargement of the rendered body, for each body."""
 _KEPT = 4  # flights of different motions, and their images
 
 
@@ -44,15 +46,27 @@ class Candidate:
     """Parameters of a simulation and its rendering.
 
     Attributes:
-        law: specification of the law.
-        deviations: deviations (9,) of velocity and spin from their estimates in standard deviations, then shift right,
-            shift down and enlargement of the rendered body in units of the setting ``pose_tolerance``.
+        law: specification of the law, or of the laws of several bodies.
+        deviations: deviations (9 times the bodies,) of velocity and spin from their estimates in standard deviations,
+            then shift right, shift down and enlargement of the rendered body in units of the setting
+            ``pose_tolerance``.
         friction: Coulomb coefficient of all obstacles. None: those of the model.
+        pairs: Coulomb coefficients of the pairs of the model. None: those of the model.
     """
 
-    law: Mapping[str, Mapping[str, Any]]
+    law: Mapping[str, Any] | Sequence[Mapping[str, Any]]
     deviations: np.ndarray
     friction: float | None = None
+    pairs: Sequence[float] | None = None
+
+    @property
+    def laws(self) -> Sequence[Mapping[str, Any]]:
+        return [self.law] if isinstance(self.law, Mapping) else self.law
+
+    def on(self, model: MPM) -> MPM:
+        """The model with its frictions."""
+        model = model if self.friction is None else model.with_friction(self.friction)
+        return model if self.pairs is None else model.with_pair_frictions(self.pairs)
 
 
 @dataclass
@@ -60,7 +74,7 @@ class _Discretisation:
     """Grid, time step and particles of simulations, and what renders them."""
 
     model: MPM
-    body: Reconstruction
+    bodies: Sequence[Reconstruction]
     films: list[Filmed]
     kernels: object = field(default_factory=object)  # key of `in_threads`
 
@@ -97,19 +111,20 @@ class VideoResiduals:
     def __init__(
         self,
         model: MPM,
-        motion: InitialMotion,
-        body: Reconstruction,
+        motion: InitialMotion | Sequence[InitialMotion],
+        body: Reconstruction | Sequence[Reconstruction],
         video: Observation | Sequence[Observation],
         settings: IdentifyConfig,
         refined: Reconstruction | None = None,
     ):
+        self.motions = [motion] if isinstance(motion, InitialMotion) else list(motion)
+        bodies = [body] if isinstance(body, Reconstruction) else list(body)
         observed = [each.select(spread_frames(len(each.frames), settings.frames)) for each in several(video)]
-        self.model, self.motion, self.frames, self.weight = model, motion, joint_frames(observed), 1.0
+        self.model, self.frames, self.weight = model, joint_frames(observed), 1.0
         self.fitted = len(self.frames)
-        self.density = float((body.mass / body.vol0).min())
-        self.unsure = np.flatnonzero(
-            [*motion.std, *[settings.pose_tolerance] * (NUISANCES - MOTION)]
-        ).tolist()
+        self.density = min(float((body.mass / body.vol0).min()) for body in bodies)
+        tolerances = [settings.pose_tolerance] * (NUISANCES - MOTION)
+        self.unsure = np.flatnonzero([[*own.std, *tolerances] for own in self.motions]).tolist()
         self.by_deviation: list[list[Tensor]] | None = None
         self.rollouts = 0
         self._pose_tolerance = settings.pose_tolerance
@@ -127,15 +142,15 @@ class VideoResiduals:
             for n in self.frames
         ]
 
-        def discretised(by: MPM, body: Reconstruction) -> _Discretisation:
-            films = (body.particle_gs(each.cameras) for each in observed)
+        def discretised(by: MPM, bodies: Sequence[Reconstruction]) -> _Discretisation:
+            films = (join(bodies).particle_gs(each.cameras) for each in observed)
             options = self._steps, settings.compare
             pairs = zip(films, observed, strict=True)
-            return _Discretisation(by, body, [Filmed(own, each, *options) for own, each in pairs])
+            return _Discretisation(by, bodies, [Filmed(own, each, *options) for own, each in pairs])
 
-        self._coarse, self._fine = discretised(model, body), None
+        self._coarse, self._fine = discretised(model, bodies), None
         if refined is not None:
-            self._fine = discretised(finer(model, settings.refinement, self._steps), refined)
+            self._fine = discretised(finer(model, settings.refinement, self._steps), [refined])
         sizes = [
             [max(1, round(each.cameras.width / across)) for across in settings.pyramid] for each in observed
         ]
@@ -175,14 +190,27 @@ class VideoResiduals:
         counts = self.counts(self.fitted)
         return sum(images[:count].numel() for images, count in zip(self._observed, counts, strict=True))
 
-    def hold_out(self, family: Family, share: float) -> None:
+    @property
+    def deviations(self) -> int:
+        """Number of deviations of a candidate."""
+        return NUISANCES * len(self.motions)
+
+    @property
+    def particles(self) -> list[int]:
+        """Number of particles of each body."""
+        return [len(body.x0) for body in self._coarse.bodies]
+
+    def hold_out(self, family: Family | Bodies, share: float) -> None:
         """Hold out the last share of the frames after the first contact, whose time is the same for any law, or of all
         frames of a clamped body."""
-        law = family.law_spec(family.values(family.unbounded(family.guess), self.model, self.density))
-        (path,), _ = self._paths([Candidate(law, np.zeros(NUISANCES))], len(self.frames), self._coarse)
-        vol0 = self._coarse.body.vol0
-        free = path is not None and not self.model.clamps
-        contact = 0 if not free else first_contact(self.model, path.at(self.frames).x, vol0, self.frames)
+        values = family.values(family.unbounded(family.guess), self.model, self.density)
+        one = Candidate(family.law_spec(values), np.zeros(self.deviations))
+        (path,), _ = self._paths([one], len(self.frames), self._coarse)
+        contact = 0
+        if path is not None and not self.model.clamps:
+            x = path.at(self.frames).x.split(self.particles, dim=1)
+            bodies = zip(x, self._coarse.bodies, strict=True)
+            contact = min(first_contact(self.model, own, body.vol0, self.frames) for own, body in bodies)
         self.fitted = held_out_frames(len(self.frames), share, contact=contact)[0]
 
     def residuals(
@@ -198,14 +226,15 @@ class VideoResiduals:
 
     def differentiate(self, at: Candidate) -> None:
         """Compute the derivatives by the deviations as forward differences, 0 where a rollout diverges."""
-        varied = [replace(at, deviations=at.deviations + step) for step in np.eye(NUISANCES)[self.unsure]]
-        simulated = [at, *(one for one, k in zip(varied, self.unsure, strict=True) if k < MOTION)]
-        count = len(self.frames)
-        paths, flown = self._paths(simulated, count, self._coarse)
         # Shift and enlargement of the rendered body need no rollout.
-        more = 1 + len(varied) - len(simulated)
+        order = sorted(self.unsure, key=lambda k: k % NUISANCES >= MOTION)
+        moved = sum(k % NUISANCES < MOTION for k in order)
+        varied = [replace(at, deviations=at.deviations + np.eye(self.deviations)[k]) for k in order]
+        count, more = len(self.frames), len(order) - moved
+        paths, flown = self._paths([at, *varied[:moved]], count, self._coarse)
         paths, flown = paths + paths[:1] * more, flown + flown[:1] * more
         base, *others = self._residuals([at, *varied], paths, flown, self._coarse, count)
+        others = [others[order.index(k)] for k in self.unsure]
         if base is not None:  # otherwise it diverges after the fitted frames
             self.by_deviation = [
                 [torch.zeros_like(r) for r in base] if each is None else _differences(each, base)
@@ -219,11 +248,9 @@ class VideoResiduals:
         the number of their states in rigid flight."""
         self.rollouts += len(candidates)
         frames = self._steps[: bisect_right(self._steps, self._last[count - 1])]
-        starts = [self.motion.moved(one.deviations[:MOTION]).of_body(on.body) for one in candidates]
-        laws = [analytic_law(one.law, on.model.dt).to(starts[0].x.device) for one in candidates]
-        models = [
-            on.model if one.friction is None else on.model.with_friction(one.friction) for one in candidates
-        ]
+        starts = [self._start(on, one) for one in candidates]
+        device, models = starts[0].x.device, [one.on(on.model) for one in candidates]
+        laws = [[analytic_law(law, on.model.dt).to(device) for law in one.laws] for one in candidates]
         flights = [self._flight(on, *each) for each in zip(candidates, laws, starts, strict=True)]
         paths: list[Trajectory | None] = [None] * len(candidates)
         for flown in {len(flight.frames) for flight in flights}:
@@ -233,7 +260,7 @@ class VideoResiduals:
             later = self._steps_of(on, (n - first for n in frames[flown:]))
             simulated = rollout_batch(
                 [models[i] for i in own],
-                [laws[i] for i in own],
+                [laws[i] if len(laws[i]) > 1 else laws[i][0] for i in own],
                 [starts[i].after(flights[i], flown - 1) if flown else starts[i] for i in own],
                 steps=later[-1],
                 frames=later,
@@ -248,9 +275,19 @@ class VideoResiduals:
         """Steps of a discretisation at the times of steps of the model."""
         return [round(n * self.model.dt / on.model.dt) for n in steps]
 
-    def _flight(self, on: _Discretisation, one: Candidate, law: Law, start: State) -> Trajectory:
+    def _start(self, on: _Discretisation, one: Candidate) -> State:
+        """Initial state of a candidate."""
+        deviations = one.deviations.reshape(-1, NUISANCES)[:, :MOTION]
+        bodies = zip(self.motions, deviations, on.bodies, strict=True)
+        states = [motion.moved(own).of_body(body) for motion, own, body in bodies]
+        return State.joined(states, separate=True) if len(states) > 1 else states[0]
+
+    def _flight(self, on: _Discretisation, one: Candidate, laws: Sequence[Law], start: State) -> Trajectory:
         """States before the first contact of a spinning body that its law keeps rigid, without frames if there are
-        none."""
+        none, as for several bodies."""
+        if start.bodies:
+            return Trajectory((), *(value[:0, None] for value in start.motion))
+        (law,) = laws
         key = (on is self._fine, one.deviations[:MOTION].tobytes())
         if key not in self._flights:
             flight = rigid_flight(on.model, start, self._steps_of(on, self._steps), self._total)
@@ -274,7 +311,7 @@ class VideoResiduals:
         def residual(each: tuple[Candidate, Trajectory | None, int]) -> list[Tensor] | None:
             return self._residual(*each, on, count)
 
-        threads = None if on.body.x0.device.type == "cpu" else 1
+        threads = None if on.bodies[0].x0.device.type == "cpu" else 1
         items = list(zip(candidates, paths, flown, strict=True))
         return in_threads(residual, items, [on.kernels] * len(items), threads)
 
@@ -285,7 +322,8 @@ class VideoResiduals:
         """Residuals of a candidate. Images of rigid flight are kept, because they are the same for all laws."""
         if path is None:
             return None
-        right, down, enlargement = (self._pose_tolerance * one.deviations[MOTION:]).tolist()
+        poses = (self._pose_tolerance * one.deviations.reshape(-1, NUISANCES)[:, MOTION:]).tolist()
+        sizes = [len(body.x0) for body in on.bodies]
         residuals, counts = [], self.counts(count)
         for k, (films, observed, size) in enumerate(zip(on.films, self._observed, self._finest, strict=True)):
             first = min(bisect_right(self._ends[k], self._steps[flown - 1]), counts[k]) if flown else 0
@@ -293,16 +331,26 @@ class VideoResiduals:
             images = [self._flown[key]] if key in self._flown else []
             parts = [] if images else [*_parts(0, first, films.batch)]
             for part in [*parts, *_parts(first, counts[k], films.batch)]:
-                x = films.states(path.x, part)
-                centre = x.mean(dim=-2, keepdim=True)
-                x = centre + (1 + enlargement) * (x - centre)
-                x = x + right * self._axes[0] + down * self._axes[1]
-                images.append(averaged(films(x, (1 + enlargement) * films.states(path.stretch, part)), size))
+                x = films.states(path.x, part).split(sizes, dim=-2)
+                F = films.states(path.stretch, part).split(sizes, dim=-3)
+                F = [(1 + enlargement) * own for own, (_, _, enlargement) in zip(F, poses, strict=True)]
+                x = [self._posed(own, *pose) for own, pose in zip(x, poses, strict=True)]
+                x, F = (
+                    x[0] if len(x) == 1 else torch.cat(x, dim=-2),
+                    F[0] if len(F) == 1 else torch.cat(F, dim=-3),
+                )
+                images.append(averaged(films(x, F, part), size))
             if parts:
                 kept = {key: torch.cat(images[: len(parts)])}
                 self._flown = {**dict(list(self._flown.items())[-_KEPT:]), **kept}
             residuals.append(self.weight * (torch.cat([*images, observed[:0]]) - observed[: counts[k]]))
         return residuals if all(bool(residual.isfinite().all()) for residual in residuals) else None
+
+    def _posed(self, x: Tensor, right: float, down: float, enlargement: float) -> Tensor:
+        """Positions (..., N, 3) [m] of a body, enlarged about its centre and shifted in the image."""
+        centre = x.mean(dim=-2, keepdim=True)
+        x = centre + (1 + enlargement) * (x - centre)
+        return x + right * self._axes[0] + down * self._axes[1]
 
 
 def _parts(first: int, last: int, size: int) -> Iterator[slice]:

@@ -222,8 +222,12 @@ def read_labels(path: str | Path) -> np.ndarray:
     Raises:
         InputError: a frame has no label_path, or its image is missing or has another size than the first.
     """
+    return _labels(_all_frames(path), path)
+
+
+def _labels(frames: Sequence[Mapping[str, Any]], path: str | Path) -> np.ndarray:
     labels, folder = [], Path(path).parent
-    for k, frame in enumerate(_all_frames(path)):
+    for k, frame in enumerate(frames):
         if not isinstance(frame.get("label_path"), str):
             raise InputError(
                 f"{path}: frame {k}", "has no label_path", "Give an image of the bodies' numbers"
@@ -234,6 +238,55 @@ def read_labels(path: str | Path) -> np.ndarray:
         if labels[-1].shape != labels[0].shape:
             raise InputError(file, f"has shape {labels[-1].shape}, but the first has {labels[0].shape}")
     return np.stack(labels)
+
+
+def list_body(source: str | Path, path: str | Path, body: int) -> tuple[int, int]:
+    """Write a transforms.json with images in which only one of several bodies is visible.
+
+    Images have an empty mask where their label is another one. Its entry ``body`` is the number of the body in the
+    labels, which remain those of all bodies (`read_hidden`). Images without the body are not listed.
+
+    Args:
+        source: a transforms.json with labels (`read_labels`).
+        path: the new transforms.json, next to which the images are written.
+        body: number of the body in the labels.
+
+    Returns:
+        numbers of listed images, and of all.
+
+    Raises:
+        InputError: see `read_image_set` and `read_labels`, or no image shows the body.
+    """
+    data, labels, images = read_transforms(source), read_labels(source), read_image_set(source).images
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    frames = []
+    for frame, pixels, label in zip(data.pop("frames"), images, labels, strict=True):
+        alpha = np.where(label == body, pixels[..., 3], 0)
+        if not (alpha > 127).any():
+            continue
+        name = f"{Path(frame['file_path']).stem}.png"
+        Image.fromarray(np.dstack([pixels[..., :3], alpha]).astype(np.uint8)).save(Path(path).parent / name)
+        label_file = image_file(Path(source).parent, frame["label_path"], source)
+        frames.append({**frame, "file_path": name, "label_path": relative_to(path, label_file)})
+    if not frames:
+        raise InputError(source, f"no image shows body {body}", "Check the labels of the images")
+    write_transforms(path, data, frames, body=body)
+    return len(frames), len(labels)
+
+
+def read_hidden(path: str | Path) -> np.ndarray | None:
+    """Pixels of all images of a list of `list_body` in which another body is visible, shape (K, H, W).
+
+    None for the images of a body without others.
+    """
+    return _hidden(_all_frames(path), path)
+
+
+def _hidden(frames: Sequence[Mapping[str, Any]], path: str | Path) -> np.ndarray | None:
+    if "body" not in frames[0]:
+        return None
+    labels = _labels(frames, path)
+    return (labels != 0) & (labels != frames[0]["body"])
 
 
 def _all_frames(path: str | Path) -> list[dict[str, Any]]:
@@ -364,7 +417,9 @@ def load_videos(
         pixels, cameras = torch.from_numpy(images.images[index]), _cameras(images, index[0])
         offsets, shares = exposure
         shares = shares if len(offsets) > 1 else None
-        observations.append(Observation(steps, pixels, cameras, offsets, shares))
+        hidden = _hidden(frames, transforms)
+        hidden = None if hidden is None else torch.from_numpy(hidden[index])
+        observations.append(Observation(steps, pixels, cameras, offsets, shares, hidden))
     return tuple(observations)
 
 

@@ -143,7 +143,7 @@ def load_initial_state(
     return State.joined([
         State.rigid(x, vol * density_at(x, density), vol, *(part[key] for key in INITIAL_MOTION))
         for x, vol, density, part in zip(x0.split(counts), vol0.split(counts), densities, parts, strict=True)
-    ]), counts  # fmt: skip
+    ], motion.get("separate", False)), counts  # fmt: skip
 
 
 def load_motion(rollout: str | Path) -> tuple[torch.Tensor, torch.Tensor]:

@@ -67,6 +67,8 @@ class Case(ABC):
         name: preset or variant whose fit is used, for example ``neuma+rank=4``.
         options: validated, an instance of `Method.Options`.
         evaluate_on: of the preset.
+        together: for a body that moves with others of a scene of several, the file of their common identification and
+            the name of the body in it.
     """
 
     scene: str
@@ -74,6 +76,7 @@ class Case(ABC):
     name: str
     options: Any
     evaluate_on: EvaluatedOn
+    together: tuple[str, str] | None
 
     @abstractmethod
     def on_moved(self) -> Case:

@@ -18,10 +18,10 @@ class Constants(Method):
     }
 
     def model_inputs(self, case: Case) -> Files:
-        return {"identified": case.result(case.identified())}
+        return {"identified": case.together[0] if case.together else case.result(case.identified())}
 
     def model_options(self, case: Case) -> dict:
-        return friction_options(case)
+        return friction_options(case) | ({"body": case.together[1]} if case.together else {})
 
     def load(self, inputs, options, dt):
         from neuma_lib.fitting.identified import recorded_friction
@@ -29,7 +29,12 @@ class Constants(Method):
         from neuma_lib.mechanics.analytic import analytic_law
         from neuma_lib.methods.model import LawOnGrid
 
-        identified = read_json(inputs["identified"])
+        identified, body = read_json(inputs["identified"]), options.get("body")
+        options = {key: value for key, value in options.items() if key != "body"}
+        if body is not None:
+            options["body"] = body
+            options["pairs"] = {frozenset(pair["bodies"]): pair["friction"] for pair in identified["pairs"]}
+            identified = identified["bodies"][body]
         law, material = analytic_law(identified["law"], dt=dt), None
         if "material" in identified:
             law.grid = identified.get("grid")

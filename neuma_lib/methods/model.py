@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import combinations
 
 from torch import Tensor
 
 from neuma_lib.mechanics.law import Law
+from neuma_lib.sim.bodies import Pair
 from neuma_lib.sim.model import MPM, as_regions, consecutive
 from neuma_lib.sim.prediction import Failure, predict
 from neuma_lib.sim.state import State, Trajectory
@@ -66,6 +69,9 @@ class LawOnGrid(MotionModel):
             bodies together.
         elsewhere: whether obstacles with a finite coefficient keep it.
         constants: of the exported law, see `MotionModel`.
+        body: name of a body that touches others.
+        pairs: Coulomb coefficients of pairs of bodies by their names, which replace those of the simulation where
+            models of several bodies are put together.
     """
 
     def __init__(
@@ -77,11 +83,15 @@ class LawOnGrid(MotionModel):
         friction: float | None = None,
         elsewhere: bool = False,
         constants: Mapping[str, Mapping[str, float]] | None = None,
+        body: str | None = None,
+        pairs: Mapping[frozenset[str], float] | None = None,
     ):
         self.law, self.constants = laws[0], constants
         self.stable, self.friction, self.elsewhere = stable, friction, elsewhere
         self._exported = exported
         self._laws, self._counts = laws, counts
+        self.body, self.pairs = body, pairs
+        self._touching: tuple[Pair, ...] = ()
 
     @property
     def exported(self) -> Law:
@@ -92,13 +102,22 @@ class LawOnGrid(MotionModel):
         """One model of several bodies, whose particles follow each other. One model is returned unchanged."""
         if len(models) == 1:
             return models[0]
-        return cls(
+        together = cls(
             *(model.law for model in models), counts=counts, stable=all(model.stable for model in models)
         )
+        names, pairs = [getattr(model, "body", None) for model in models], getattr(models[0], "pairs", None)
+        together._touching = tuple(
+            Pair(a, b, pairs[key])
+            for a, b in combinations(range(len(names)), 2)
+            if (key := frozenset((names[a], names[b]))) in (pairs or {})
+        )
+        return together
 
     def predict(self, mpm, state, frames, tracers=None, total=False):
         if self.friction is not None:
             mpm = mpm.with_friction(self.friction, given=not self.elsewhere)
+        if self._touching:
+            mpm = replace(mpm, pairs=self._touching)
         return predict(mpm, self._bodies(state), state, frames, tracers, total)
 
     def courant(self, mpm: MPM, state: State) -> float:

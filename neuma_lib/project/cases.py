@@ -35,6 +35,7 @@ class ProjectCase(Case):
     options: Any
     evaluate_on: str
     method: Method
+    together: tuple[str, str] | None = None
 
     def on_moved(self) -> ProjectCase:
         return replace(self, scene=self.moved)
@@ -207,6 +208,11 @@ def case(settings: Config, scene: str, method: str) -> ProjectCase:
         InputError: unknown names, options that do not fit.
     """
     chosen, _ = preset(settings, method)
+    if settings.scene(scene).bodies:
+        problem = "it has several bodies, and a model is of one"
+        raise InputError(
+            f"{scene}/{method}", problem, f"Take the scenes {', '.join(settings.body_scenes(scene))}"
+        )
     kind, source = kind_of(settings, method), source_scene(settings, scene, method)
     name, options = fit_name(settings, method), _options(settings, source, method)
     check_prior(settings, method, options)
@@ -260,6 +266,11 @@ def body_cases(settings: Config, column: str, method: str) -> list[ProjectCase]:
         InputError: several bodies, and a model without a material law.
     """
     cases = [case(settings, scene, method) for scene in settings.body_scenes(column)]
+    pile, names = settings.touching_bodies(column)
+    base, seeds = settings.replicate(column)
+    if pile and not (base in settings.scenes and settings.scenes[base].part_of):
+        file = paths.result_path(settings, replicate_folder(pile, seeds), "identified.json")
+        cases = [replace(each, together=(file, name)) for each, name in zip(cases, names, strict=True)]
     if len(cases) > 1 and not cases[0].method.has_law:
         raise InputError(
             f"{column}/{method}", "it has no material law, so that it cannot move several bodies together"

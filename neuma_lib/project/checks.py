@@ -81,7 +81,7 @@ def _laws(settings: Config) -> Iterator[tuple[str, dict[str, Any]]]:
     """All laws in the settings with their keys; of ranges the two ends."""
     drawn = set(settings.random_scenes)
     for name, scene in settings.scenes.items():
-        if scene.law is not None and name not in drawn:
+        if scene.law is not None and name not in drawn and not scene.part_of:
             yield f"scenes.{name}.law", scene.law.plain()
         for key, body in scene.bodies.items():
             yield f"scenes.{name}.bodies.{key}.law", body.law.plain()
@@ -119,7 +119,7 @@ def _scene_problems(settings: Config, own_captures: bool = False) -> Iterator[st
         if own_captures:
             yield from map(str, prior_errors(settings, name))
         yield from _mesh_problems(*settings.colliders(name))
-        if scene.has_truth or scene.bodies:
+        if scene.has_truth and not scene.part_of or scene.bodies:
             truth = settings.scene_truth(name)
             for body in settings.scene_bodies(name):
                 own = f"{where}.bodies.{body['name']}" if scene.bodies else where

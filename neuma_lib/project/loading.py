@@ -8,6 +8,7 @@ from typing import Any
 
 from neuma_lib.config.capture import CapturesConfig
 from neuma_lib.config.priors import PriorsConfig
+from neuma_lib.config.scenes import SceneConfig
 from neuma_lib.config.simulation import SimulationConfig
 from neuma_lib.config.validation import hint, validate, with_advanced
 from neuma_lib.errors import InputError
@@ -48,7 +49,7 @@ def load(
             raise InputError(f"scenes.{name}", f"{kind} a scene of this name", "Rename one of the two")
         scenes |= others
     if isinstance(changes, Mapping):
-        changes = _complete(_with_takes(merged(scenes, changes)))
+        changes = _with_parts(_complete(_with_takes(merged(scenes, changes))))
     extensions = _extensions(raw, root)
     presets = raw.get("methods") or {}
     if isinstance(presets, Mapping):
@@ -100,6 +101,34 @@ def _with_takes(scenes: Mapping[str, Any]) -> dict[str, Any]:
                     raise InputError(f"scenes.{name}.videos", problem, "Rename the scene")
                 complete[take] = {"like": name, **video}
         complete[name] = {**scene, "videos": names}
+    return complete
+
+
+OF_ALL_BODIES = ("truth", "dt", "steps", "frames", "prior", "colliders", "friction", "training")
+"""Keys of a scene of several bodies that the scenes of its bodies share."""
+
+
+def _with_parts(scenes: Mapping[str, Any]) -> dict[str, Any]:
+    """Scenes, and a scene ``<name>_<body>`` for each body of those with several.
+
+    There are none for an invalid scene, which `load` reports.
+    """
+    complete = dict(scenes)
+    for name, scene in scenes.items():
+        if not isinstance(scene, Mapping) or not scene.get("bodies"):
+            continue
+        try:
+            pile = validate(SceneConfig, scene, f"scenes.{name}").plain()
+        except InputError:
+            continue
+        shared = {key: pile[key] for key in OF_ALL_BODIES}
+        for key, body in pile["bodies"].items():
+            part = f"{name}_{key}"
+            if part in scenes:
+                problem = f"the scene of the body {key} is called {part}, as another scene"
+                raise InputError(f"scenes.{name}.bodies.{key}", problem, "Rename one of the two")
+            known = {field: value for field, value in body.items() if field in SceneConfig.model_fields}
+            complete[part] = {**shared, **known, "part_of": [name, key]}
     return complete
 
 

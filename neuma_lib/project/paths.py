@@ -8,17 +8,18 @@ from __future__ import annotations
 import re
 
 from neuma_lib.config.variants import replicate_folder
-from neuma_lib.errors import InputError
 from neuma_lib.project.settings import Config
 
 FIELD = "pac_nerf/field.safetensors"
 IDENTIFIED = "identified"
 """Name of the prior that is the law identified from the scene's video."""
 SEEDS_OF = {
-    **dict.fromkeys(["gaussians.ply", "gaussians.json", "mesh.ply", "tracers.h5", FIELD], ["gaussians"]),
+    **dict.fromkeys(
+        ["gaussians.ply", "gaussians.json", "whole.ply", "mesh.ply", "tracers.h5", FIELD], ["gaussians"]
+    ),
     **dict.fromkeys(["sampled_particles.h5", "particles.h5", "binding.h5"], ["gaussians", "particles"]),
     **dict.fromkeys(
-        ["velocity.json", "identified.json", "priors/identified.safetensors", "visited.h5"],
+        ["velocity.json", "motions.json", "identified.json", "priors/identified.safetensors", "visited.h5"],
         ["prior", "gaussians", "particles"],
     ),
 }
@@ -29,12 +30,6 @@ SEEDS_OF = {
 def result_path(settings: Config, name: str, file: str) -> str:
     """Path of a file of a scene or experiment in a replicate."""
     results, (base, seeds) = results_root(settings), settings.replicate(name)
-    if base in settings.scenes and settings.scenes[base].bodies:
-        raise InputError(
-            f"scenes.{base}.bodies",
-            "several bodies are simulated, rendered and divided, but no method identifies their laws",
-            f"Request files of {settings.data_root.rstrip('/')}/{base}, or gaussians.ply and bodies of its results",
-        )
     if base in settings.scenes:
         seeds_used = SEEDS_OF[re.sub("[+]views=[0-9,]+", "", file)]
         return f"{results}/{replicate_folder(base, seeds, seeds_used)}/{file}"

@@ -119,7 +119,8 @@ class Config(Section):
 
     @property
     def plain_scenes(self) -> list[str]:
-        """Names of the scenes with a truth of default resolution, without random ones and those of optional tables."""
+        """Names of the scenes with a truth of default resolution, without random ones, those of optional tables, and
+        bodies of a scene of several."""
         in_tables: dict[bool, set[str]] = {True: set(), False: set()}
         for table in self.tables.values():
             in_tables[table.default_target].update(table.scenes)
@@ -127,7 +128,7 @@ class Config(Section):
         return [
             name
             for name, scene in self.scenes.items()
-            if scene.has_truth and scene.truth == TruthConfig() and name not in excluded
+            if scene.has_truth and scene.truth == TruthConfig() and not scene.part_of and name not in excluded
         ]
 
     def experiment(self, name: str) -> ExperimentConfig:
@@ -174,17 +175,40 @@ class Config(Section):
         plain = {key: [each.arguments() for each in entries] for key, entries in lists.items() if entries}
         friction = self.scenes[experiment.bodies[0].scene if experiment else base].friction
         plain |= {} if friction is None else {"boundary": friction}
-        scene = None if experiment else self.scenes[base]
-        if scene and scene.pairs:
-            plain["pairs"] = [_pair_arguments(pair, list(scene.bodies)) for pair in scene.pairs]
-        touches = plain.keys() & {"colliders", "boundary"} or scene and scene.bodies
+        pile, bodies = self.touching_bodies(name)
+        pairs = self.scenes[pile].pairs if pile and len(bodies) > 1 else ()
+        if plain_pairs := [_pair_arguments(pair, bodies) for pair in pairs if {*pair.bodies} <= {*bodies}]:
+            plain["pairs"] = plain_pairs
+        touches = plain.keys() & {"colliders", "boundary"} or pile
         return plain | ({"contact": "particles"} if touches else {})
 
+    def touching_bodies(self, name: str) -> tuple[str | None, list[str]]:
+        """The scene of several bodies that the bodies of a scene or an experiment are from, and their names there.
+
+        (None, []) for other bodies, which stick where they touch.
+        """
+        base, _ = self.replicate(name)
+        if base in self.scenes and self.scenes[base].bodies:
+            return base, list(self.scenes[base].bodies)
+        own = self.experiments[base].bodies if base in self.experiments else ()
+        parts = [self.scenes[body.scene].part_of for body in own] if own else [self.scenes[base].part_of]
+        piles = {part[0] if part else None for part in parts}
+        names = [part[1] for part in parts if part]
+        if len(piles) > 1 or None in piles or len({*names}) < len(names):
+            return None, []
+        return piles.pop(), names
+
     def scene_bodies(self, name: str) -> list[dict[str, Any]]:
-        """Plain descriptions of the bodies of a scene: those of several with their ``name``, or the scene itself."""
+        """Plain descriptions of the bodies of a scene: the scene itself, or those of several.
+
+        Each of several has its ``name``, its own ``scene``, and ``reconstructed``, as of `experiment_bodies`.
+        """
         scene = self.scene(name)
-        several = [{"name": key, **body.plain()} for key, body in scene.bodies.items()]
-        return several or [scene.plain()]
+        several = zip(self.body_scenes(name), scene.bodies.items(), strict=False)
+        bodies = [
+            {"name": key, "scene": own, "reconstructed": True, **body.plain()} for own, (key, body) in several
+        ]
+        return bodies or [scene.plain()]
 
     def colliders(self, name: str) -> tuple[str, tuple[ColliderConfig, ...]]:
         """Path of the key with the colliders of a scene or an experiment, and them."""
@@ -260,7 +284,8 @@ class Config(Section):
         """Folders of the scenes whose laws the bodies of a scene or experiment have, in its replicate."""
         base, seeds = self.replicate(column)
         if base in self.scenes:
-            return [column]
+            parts = [replicate_folder(f"{base}_{body}", seeds) for body in self.scenes[base].bodies]
+            return parts or [column]
         return [replicate_folder(body.scene, seeds) for body in self.experiments[base].bodies]
 
     def frame_steps(self, name: str) -> tuple[int, ...]:

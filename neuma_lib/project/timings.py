@@ -21,13 +21,14 @@ COLUMNS = {
 MAXIMA = ("longest", "memory")
 """Columns that hold the maximum over the runs; the others hold the sum."""
 
-_CORE_SECONDS = re.compile(r"core seconds: ([\d.]+) to start, ([\d.]+) of work")
+_USED = re.compile(r"core seconds: ([\d.]+) to start, ([\d.]+) of work(?:; memory: ([\d.]+) MB)?")
 
 
 def timings_table(results: Path) -> str:
     """Markdown table with a row for each stage, the most expensive first, and their total.
 
-    Core seconds come from the logs: Snakemake samples those of a job only now and then and misses up to 30 s of each.
+    Core seconds and memory come from the logs. Snakemake samples a job only now and then, misses up to 30 s of each,
+    and does not see the process that runs a script (`workflow.preloaded`).
 
     Args:
         results: folder with the subfolders ``benchmarks`` and ``logs``.
@@ -51,10 +52,10 @@ def timings_table(results: Path) -> str:
     return "\n".join(as_markdown(["stage", *COLUMNS.values()], cells, numbers=True)) + "\n"
 
 
-def core_seconds(log: Path) -> tuple[float, float] | None:
-    """Core seconds that a script took to start and to work, from its log; None if it did not finish."""
-    runs = _CORE_SECONDS.findall(log.read_text()) if log.exists() else []
-    return tuple(map(float, runs[-1])) if runs else None
+def used(log: Path) -> tuple[float, float, float] | None:
+    """Core seconds to start and to work, and most memory [MB] of a script, from its log; None if it did not finish."""
+    runs = _USED.findall(log.read_text()) if log.exists() else []
+    return tuple(float(value or 0) for value in runs[-1]) if runs else None
 
 
 def _aggregate(runs: Sequence[Mapping[str, float]]) -> dict[str, float]:
@@ -68,12 +69,12 @@ def _measured(benchmark: Path, log: Path) -> dict[str, float]:
         measured = dict(zip(header, values, strict=True))
         seconds, memory = float(measured["s"]), measured["max_rss"]
         memory = 0.0 if memory in ("-", "NA") else float(memory)
-    start, work = core_seconds(log) or (0.0, 0.0)
+    start, work, most = used(log) or (0.0, 0.0, 0.0)
     return {
         "runs": 1,
         "seconds": seconds,
         "longest": seconds,
         "core_seconds": start + work,
         "start": start,
-        "memory": memory,
+        "memory": max(memory, most),
     }

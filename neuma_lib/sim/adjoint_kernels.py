@@ -13,11 +13,12 @@ import torch
 import warp as wp
 
 from neuma_lib.sim.body_contact import body_functions
-from neuma_lib.sim.clamp_kernels import clamp_functions, hold_type
-from neuma_lib.sim.contact_kernels import contact_functions, obstacle_type
+from neuma_lib.sim.clamp_kernels import clamp_functions
+from neuma_lib.sim.contact_kernels import contact_functions
 from neuma_lib.sim.gather import gather_functions
-from neuma_lib.sim.kernels import NO_CONTACT, grid_functions, warp_types
+from neuma_lib.sim.kernels import NO_CONTACT, grid_functions
 from neuma_lib.sim.scatter import scatter_functions
+from neuma_lib.sim.warp_types import typed, warp_types
 
 
 @functools.cache
@@ -26,21 +27,15 @@ def adjoint_functions(dtype: torch.dtype, clamps: bool, bodies: bool) -> SimpleN
     t, wall_mask = warp_types(dtype), grid_functions(dtype).wall_mask
     real, vec3, vec4, mat33, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.GridConstants
     mass_gradient = body_functions(dtype, GridConstants).mass_gradient if bodies else None
+    row = typed(dtype, 1)
 
     @wp.func
     def deformation_adjoint(c: GridConstants, C_after: mat33, grad_F_trial: mat33):
         """Gradient of F from F_trial = (I + dt C) F."""
         return grad_F_trial + c.dt * (wp.transpose(C_after) * grad_F_trial)
 
-    @wp.func
-    def node_adjoint(
-        c: GridConstants,
-        node: wp.int32,
-        grid: wp.array(dtype=vec4),
-        grad_grid: wp.array(dtype=vec4),
-        grad_before: wp.array(dtype=vec4),
-        grad_around: wp.array(dtype=vec4),
-    ):
+    @row.func
+    def node_adjoint(c, node, grid, grad_grid, grad_before, grad_around):
         """In place: from the gradient of a node's velocity to those of its momentum and mass.
 
         With several bodies the gradient of the velocity before contact is in ``grad_before`` (`body_contact`).
@@ -72,44 +67,25 @@ def adjoint_kernels(
     See `kernels.forward_kernels`.
     """
     contact, clamps, bodies = "contact" in features, "clamps" in features, "bodies" in features
-    Hold, held, _ = hold_type(dtype), *vars(clamp_functions(dtype)).values()
+    held = clamp_functions(dtype).held
     t, functions = warp_types(dtype), grid_functions(dtype)
-    Obstacle, touching = obstacle_type(dtype), contact_functions(dtype, features)
+    touching = contact_functions(dtype, features)
     touch, touch_adjoint = touching.contact, touching.contact_adjoint
     ordered = scatter != "atomic"
     run_of, deposit = scatter_functions(dtype, scatter, 3)
-    real, vec3, vec4, mat33, mat34, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.mat34, t.GridConstants
+    real, vec3, vec4, mat33 = t.real, t.vec3, t.vec4, t.mat33
     stencil, slopes, moments = functions.stencil, functions.slopes, functions.moments
     column, moved_mask, obstacle_row = functions.column, functions.moved_mask, functions.obstacle_row
     deformation_adjoint, node_adjoint = vars(adjoint_functions(dtype, clamps, bodies)).values()
     gather, three_nodes = gather_functions(dtype)
     module = f"neuma_lib.sim.adjoint_{str(dtype).removeprefix('torch.')}_{'_'.join((scatter, *features))}"
-    kernel = functools.partial(wp.kernel, enable_backward=False, module=module)
+    kernel = typed(dtype, 2).kernel(module)
 
     @kernel
     def g2p_adjoint(
-        c: GridConstants,
-        now: wp.int32,
-        after: wp.int32,
-        cached: wp.int32,
-        side: wp.int32,
-        sort: wp.int32,
-        pose: wp.int32,
-        order: wp.array2d(dtype=wp.int32),
-        x: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        C: wp.array2d(dtype=mat33),
-        F: wp.array2d(dtype=mat33),
-        grid_v_rows: wp.array2d(dtype=mat34),
-        grad_v: wp.array(dtype=vec3),
-        grad_C: wp.array(dtype=mat33),
-        grad_F_trial: wp.array(dtype=mat33),
-        grad_x: wp.array(dtype=vec3),
-        grad_F: wp.array(dtype=mat33),
-        holds: wp.array2d(dtype=Hold),
-        clamp: wp.array(dtype=wp.int32),
-        grad_grid_rows: wp.array2d(dtype=mat34),
-    ):
+        c, now, after, cached, side, sort, pose, order, x, v, C, F, grid_v_rows, grad_v, grad_C,
+        grad_F_trial, grad_x, grad_F, holds, clamp, grad_grid_rows,
+    ):  # fmt: skip
         """From gradients of x, v, C after the step and of F_trial to those of grid_v (added), x and F (set)."""
         p = wp.tid()
         alive = p < grad_x.shape[0]
@@ -152,15 +128,7 @@ def adjoint_kernels(
             grad_x[p] = g_x + c.inv_dx * (moving - wp.transpose(D) * v[after, p])
 
     @kernel
-    def grid_adjoint(
-        c: GridConstants,
-        cached: wp.int32,
-        side: wp.int32,
-        grid: wp.array2d(dtype=vec4),
-        grad_grid: wp.array2d(dtype=vec4),
-        grad_before: wp.array(dtype=vec4),
-        grad_around: wp.array(dtype=vec4),
-    ):
+    def grid_adjoint(c, cached, side, grid, grad_grid, grad_before, grad_around):
         """Gradients of the nodes in place (`adjoint_functions`).
 
         Clears the other side of `grad_grid` for the previous step.
@@ -171,30 +139,9 @@ def adjoint_kernels(
 
     @kernel
     def p2g_adjoint(
-        c: GridConstants,
-        now: wp.int32,
-        cached: wp.int32,
-        side: wp.int32,
-        pose: wp.int32,
-        x: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        C: wp.array2d(dtype=mat33),
-        tau: wp.array2d(dtype=mat33),
-        mass: wp.array(dtype=real),
-        vol0: wp.array(dtype=real),
-        radius: wp.array(dtype=real),
-        obstacles: wp.array2d(dtype=Obstacle),
-        distances: wp.array(dtype=real),
-        stuck: wp.array2d(dtype=vec3),
-        holds: wp.array2d(dtype=Hold),
-        clamp: wp.array(dtype=wp.int32),
-        grad_grid_rows: wp.array2d(dtype=mat34),
-        grad_x: wp.array(dtype=vec3),
-        grad_v: wp.array(dtype=vec3),
-        grad_C: wp.array(dtype=mat33),
-        grad_tau: wp.array(dtype=mat33),
-        grad_stuck: wp.array(dtype=vec3),
-    ):
+        c, now, cached, side, pose, x, v, C, tau, mass, vol0, radius, obstacles, distances, stuck, holds,
+        clamp, grad_grid_rows, grad_x, grad_v, grad_C, grad_tau, grad_stuck,
+    ):  # fmt: skip
         """From gradients of momentum and mass of the nodes to those of x (added), v, C and tau (set)."""
         p = wp.tid()
         first, f, wi, wj, wk = stencil(c, p, x[now, p])
@@ -261,19 +208,10 @@ def adjoint_kernels(
 
     body_contact_adjoint = None
     if bodies:
-        contact_adjoint = body_functions(dtype, GridConstants).adjoint
+        contact_adjoint = body_functions(dtype, t.GridConstants).adjoint
 
         @kernel
-        def body_contact_adjoint(
-            c: GridConstants,
-            cached: wp.int32,
-            side: wp.int32,
-            grid: wp.array2d(dtype=vec4),
-            grad_grid: wp.array2d(dtype=vec4),
-            pairs: wp.array2d(dtype=real),
-            grad_before: wp.array(dtype=vec4),
-            grad_around: wp.array(dtype=vec4),
-        ):
+        def body_contact_adjoint(c, cached, side, grid, grad_grid, pairs, grad_before, grad_around):
             contact_adjoint(c, pairs, grid[cached], grad_grid[side], wp.tid(), grad_before, grad_around)
 
     return SimpleNamespace(

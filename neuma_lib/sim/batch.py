@@ -11,7 +11,7 @@ import torch
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.mechanics.law import Law
 from neuma_lib.mechanics.side_by_side import fusible, has_kernels, side_by_side
-from neuma_lib.sim.model import MPM, MaterialRegion, model_of_each
+from neuma_lib.sim.model import MPM, consecutive, model_of_each
 from neuma_lib.sim.rollout import check_bodies, check_inside, checked_frames, fly_and_simulate
 from neuma_lib.sim.state import State, Trajectory
 from neuma_lib.threads import in_threads
@@ -24,7 +24,7 @@ cache."""
 
 def rollout_batch(
     model: MPM | Sequence[MPM],
-    laws: Sequence[Law],
+    laws: Sequence[Law | Sequence[Law]],
     start: State | Sequence[State],
     *,
     steps: int,
@@ -41,7 +41,7 @@ def rollout_batch(
 
     Args:
         model: as in `rollout`, one for all laws or one per law. They may differ in friction.
-        laws: B laws, each for all particles.
+        laws: B laws, each for all particles, or sequences of the laws of all bodies of the states, in their order.
         start: N particles, one initial state for all laws or one per law.
         steps, frames, total: as in `rollout`.
         skip_free_flight: as in `rollout`, up to the first contact of any copy in the same launches.
@@ -51,8 +51,8 @@ def rollout_batch(
         The trajectory of each law, or None where it diverged. The log (level INFO) states why.
 
     Raises:
-        InputError: as `rollout`, or the numbers of laws, models, initial states or their particles do not match, or
-            the models differ in more than friction.
+        InputError: as `rollout`, or the numbers of laws, models, initial states, bodies or their particles do not
+            match, or the models differ in more than friction.
     """
     frames = checked_frames(frames, steps)
     starts = [start] * len(laws) if isinstance(start, State) else list(start)
@@ -63,6 +63,9 @@ def rollout_batch(
             f"{len(laws)} laws do not match initial states of {[len(state.x) for state in starts]} particles",
             "Give one state for all laws or one per law, with equal numbers of particles",
         )
+    if wrong := {_bodies(own) for own in laws} - {1, len(starts[0].bodies)}:
+        problem = f"{wrong.pop()} laws do not match {max(1, len(starts[0].bodies))} bodies"
+        raise InputError("laws", problem, "Give one law for all particles, or one per body")
     models = model_of_each(model, len(laws))
     model = models[0]
     if any(own.frictionless != model.frictionless for own in models):
@@ -70,11 +73,11 @@ def rollout_batch(
     for state in {id(state): state for state in starts}.values():
         check_bodies(model, state)
         check_inside(model, state.x)
-    order = sorted(range(len(laws)), key=lambda copy: not fusible(laws[copy]))
+    order = sorted(range(len(laws)), key=lambda copy: not _fusible(laws[copy]))
     device, dtype = starts[0].x.device, starts[0].x.dtype
     together = together or TOGETHER[device.type]
-    viscous = [copy for copy in order if laws[copy].viscosity is not None]
-    order = [copy for copy in order if laws[copy].viscosity is None]
+    viscous = [copy for copy in order if any(law.viscosity is not None for law in _each(laws[copy]))]
+    order = [copy for copy in order if copy not in viscous]
     groups = [order[i : i + together] for i in range(0, len(order), together)] + [[copy] for copy in viscous]
 
     def simulated(copies: Sequence[int]) -> list[Trajectory | None]:
@@ -82,7 +85,8 @@ def rollout_batch(
         frictions = [models[copy].frictions for copy in copies]
         return _side_by_side(model, *own, frames, total, skip_free_flight, frictions)
 
-    threads = 1 if device.type == "cuda" or not all(map(has_kernels, laws)) else None
+    every = [law for own in laws for law in _each(own)]
+    threads = 1 if device.type == "cuda" or not all(map(has_kernels, every)) else None
     kernels = [(rollout_batch, model.frictionless, dtype, total, _kinds(laws, copies)) for copies in groups]
     paths = in_threads(simulated, groups, kernels, threads)
     result: list[Trajectory | None] = [None] * len(laws)
@@ -92,17 +96,32 @@ def rollout_batch(
 
 
 @torch.no_grad()
-def _kinds(laws: Sequence[Law], copies: Sequence[int]) -> tuple[tuple[type, ...], ...]:
+def _kinds(laws: Sequence[Law | Sequence[Law]], copies: Sequence[int]) -> tuple[tuple[type, ...], ...]:
     """Classes of the parts of some laws, which determine their kernels."""
     return tuple(
         tuple(type(part) for part in (law.elasticity, law.plasticity, law.viscosity))
-        for law in (laws[copy] for copy in copies)
+        for copy in copies
+        for law in _each(laws[copy])
     )
+
+
+def _each(laws: Law | Sequence[Law]) -> tuple[Law, ...]:
+    """The law of all particles, or the laws of the bodies."""
+    return (laws,) if isinstance(laws, Law) else tuple(laws)
+
+
+def _bodies(laws: Law | Sequence[Law]) -> int:
+    return len(_each(laws))
+
+
+def _fusible(laws: Law | Sequence[Law]) -> bool:
+    """Whether a copy shares launches of its laws with others, whose ranges of particles are equally long."""
+    return isinstance(laws, Law) and fusible(laws)
 
 
 def _side_by_side(
     model: MPM,
-    laws: Sequence[Law],
+    laws: Sequence[Law | Sequence[Law]],
     starts: Sequence[State],
     frames: tuple[int, ...],
     total: bool,
@@ -111,17 +130,20 @@ def _side_by_side(
 ) -> list[Trajectory | None]:
     """Simulate laws in the same launches, those with fused kernels first."""
     N, copies = len(starts[0].x), len(laws)
-    fused = sum(map(fusible, laws))
-    regions = [
-        MaterialRegion(law, copy * N, (copy + 1) * N) for copy, law in enumerate(laws) if copy >= fused
+    fused, counts = sum(map(_fusible, laws)), starts[0].bodies
+    together = [side_by_side(laws[:fused], starts[0].x.device)] if fused else []
+    alone = [
+        (law, n)
+        for own in laws[fused:]
+        for law, n in zip(_each(own), counts if _bodies(own) > 1 else (N,), strict=True)
     ]
-    if fused:
-        regions.insert(0, MaterialRegion(side_by_side(laws[:fused], starts[0].x.device), 0, fused * N))
+    sizes = [fused * N] * len(together) + [n for _, n in alone]
+    regions = consecutive([*together, *(law for law, _ in alone)], sizes)
     state = State.joined(starts) if copies > 1 else starts[0]
     try:
         path, errors = fly_and_simulate(
             model,
-            tuple(regions),
+            regions,
             state,
             frames,
             None,

@@ -50,7 +50,7 @@ class Equilibrium:
 
     Attributes:
         x: positions of the nodes [m], shape (N, 3).
-        load: forces of gravity on the nodes [N], shape (N, 3).
+        load: forces of gravity and of what holds the body on the nodes [N], shape (N, 3).
         free: whether a node moves, shape (N,).
         factors: of the tangent in the free displacements.
         residual: norm of the forces that remain, in units of the load.
@@ -81,6 +81,7 @@ def solve_equilibrium(
     gravity: Sequence[float] | Array,
     clamps: Sequence[Clamp],
     start: Array | None = None,
+    forces: Array | None = None,
 ) -> Equilibrium:
     """Positions of a body at rest.
 
@@ -94,6 +95,7 @@ def solve_equilibrium(
         gravity: acceleration [m/s^2], shape (3,).
         clamps: regions that are held in place.
         start: positions (N, 3) [m] near the solution, for example with slightly different constants.
+        forces: further forces on the nodes (N, 3) [N], such as those that hold the body before a release.
 
     Raises:
         InputError: no node is clamped, or all are.
@@ -101,6 +103,8 @@ def solve_equilibrium(
     """
     free = ~clamped_nodes(body, clamps)
     load = density * body.node_volumes[:, None] * np.asarray(gravity, dtype=np.float64)
+    if forces is not None:
+        load = load + forces
     if start is not None:
         x = np.where(free[:, None], start, body.nodes)
         if (solution := _newton(body, law, load, free, x, TOLERANCE)) is not None:

@@ -135,6 +135,35 @@ class Hexahedra:
         np.add.at(result, self.cells, parts)
         return result
 
+    def at(self, points: Array) -> tuple[csr_matrix, list[csr_matrix]]:
+        """Interpolation of values of the nodes at points of the undeformed body.
+
+        Args:
+            points: shape (P, 3) [m].
+
+        Returns:
+            Weights (P, N) of the nodes, and their derivatives by position on each axis [1/m], three of (P, N).
+
+        Raises:
+            InputError: a point is outside the body.
+        """
+        low, high = self.nodes[self.cells[:, 0]], self.nodes[self.cells[:, -1]]
+        slack = 1e-6 * np.ptp(self.nodes, axis=0).max()
+        own = (points[:, None] >= low - slack) & (points[:, None] <= high + slack)
+        inside = own.all(axis=2)
+        if not inside.any(axis=1).all():
+            where = ", ".join(f"{value:.4g}" for value in points[~inside.any(axis=1)][0])
+            raise InputError("points", f"({where}) m is outside the body")
+        cell = inside.argmax(axis=1)
+        half = (high - low)[cell] / 2
+        local = (points - low[cell]) / half - 1
+        slopes = shape_gradients(local) / half[:, None]
+        rows, columns = np.repeat(np.arange(len(points)), NODES), self.cells[cell].ravel()
+        values = [shape_functions(local), *np.moveaxis(slopes, 2, 0)]
+        shape = len(points), len(self.nodes)
+        weights, *derivatives = (csr_matrix((own.ravel(), (rows, columns)), shape) for own in values)
+        return weights, derivatives
+
     def surface(self, length: float) -> tuple[csr_matrix, NDArray[np.int64]]:
         """The outer surface as triangles.
 

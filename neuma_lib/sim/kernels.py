@@ -25,13 +25,13 @@ import torch
 import warp as wp
 
 from neuma_lib.device import start_warp
-from neuma_lib.sim.bodies import MAX_RANGES
 from neuma_lib.sim.body_contact import body_functions
-from neuma_lib.sim.clamp_kernels import clamp_functions, hold_type
+from neuma_lib.sim.clamp_kernels import clamp_functions
 from neuma_lib.sim.clamps import HELD_SHARE
-from neuma_lib.sim.contact_kernels import contact_functions, obstacle_type
+from neuma_lib.sim.contact_kernels import contact_functions
 from neuma_lib.sim.gather import gather_functions
 from neuma_lib.sim.scatter import scatter_functions
+from neuma_lib.sim.warp_types import typed, warp_types
 
 start_warp()
 
@@ -43,48 +43,6 @@ NO_FAULT = 2**62
 
 NO_CONTACT = -1e3
 """Radius [m] of clamped particles, which touch no collider."""
-
-
-@functools.cache
-def warp_types(dtype: torch.dtype) -> SimpleNamespace:
-    """Warp's scalar, vector and matrix types for a torch precision, and the struct of model constants."""
-    real = {torch.float32: wp.float32, torch.float64: wp.float64}[dtype]
-    types = SimpleNamespace(
-        real=real,
-        vec3=wp.types.vector(length=3, dtype=real),
-        vec4=wp.types.vector(length=4, dtype=real),
-        mat33=wp.types.matrix(shape=(3, 3), dtype=real),
-        mat34=wp.types.matrix(shape=(3, 4), dtype=real),
-        walls=wp.types.vector(length=6, dtype=wp.int32),
-        starts=wp.types.vector(length=MAX_RANGES + 1, dtype=wp.int32),
-        body_of=wp.types.vector(length=MAX_RANGES, dtype=wp.int32),
-    )
-
-    @wp.struct
-    class GridConstants:
-        n: wp.int32  # nodes along an edge
-        particles: wp.int32  # per copy
-        copies: wp.int32
-        bodies: wp.int32  # per copy
-        fields: wp.int32  # grids, one of each body of each copy
-        ranges: wp.int32  # of particles of a copy that belong to one body
-        starts: types.starts  # first particle of each range in its copy, and the end of the last
-        body_of: types.body_of  # body of each range
-        wall_nodes: wp.int32  # thickness of a wall
-        faces: wp.int32  # first obstacles that are faces of the unit cube
-        walls: types.walls  # condition on x_min, x_max, y_min, y_max, z_min, z_max
-        first: real  # coordinate of node 0 [dx]
-        dx: real  # node spacing [m]
-        inv_dx: real
-        dt: real  # [s]
-        gravity: types.vec3  # [m/s^2]
-        clamp_low: real  # bounds to which coordinates of particles are clamped [m]
-        clamp_high: real
-        leave_low: real  # bounds beyond which a particle has left the grid [m]
-        leave_high: real
-
-    types.GridConstants = GridConstants
-    return types
 
 
 @functools.cache
@@ -211,22 +169,15 @@ def grid_functions(dtype: torch.dtype) -> SimpleNamespace:
 def forward_functions(dtype: torch.dtype, clamps: bool, bodies: bool) -> SimpleNamespace:
     """Parts of the forward kernels that are the same on every device: for a held particle, a node, and a particle."""
     t, functions = warp_types(dtype), grid_functions(dtype)
-    Hold, (_, prescribed) = hold_type(dtype), vars(clamp_functions(dtype)).values()
-    real, vec3, vec4, mat33, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.GridConstants
+    prescribed = clamp_functions(dtype).prescribed
+    real, vec3, vec4, mat33 = t.real, t.vec3, t.vec4, t.mat33
     copy_of, stencil = functions.copy_of, functions.stencil
     wall_mask, moved = functions.wall_mask, functions.moved
     contact_change = body_functions(dtype, t.GridConstants).change if bodies else None
+    row = typed(dtype, 1)
 
-    @wp.func
-    def hold_mass(
-        c: GridConstants,
-        p: wp.int32,
-        x: vec3,
-        m: real,
-        clamp: wp.int32,
-        held_mass: wp.array(dtype=real),
-        held_by: wp.array(dtype=wp.int32),
-    ):
+    @row.func
+    def hold_mass(c, p, x: vec3, m: real, clamp: wp.int32, held_mass, held_by):
         """Add the mass of a clamped particle to the clamped mass of its nodes."""
         first, _, wi, wj, wk = stencil(c, p, x)
         for node in range(27):
@@ -235,18 +186,8 @@ def forward_functions(dtype: torch.dtype, clamps: bool, bodies: bool) -> SimpleN
             wp.atomic_add(held_mass, here, wi[i] * wj[j] * wk[k] * m)
             wp.atomic_max(held_by, here, clamp)
 
-    @wp.func
-    def update_node(
-        c: GridConstants,
-        pose: wp.int32,
-        node: wp.int32,
-        grid: wp.array(dtype=vec4),
-        grid_v: wp.array(dtype=vec4),
-        holds: wp.array2d(dtype=Hold),
-        held_mass: wp.array(dtype=real),
-        held_by: wp.array(dtype=wp.int32),
-        pairs: wp.array2d(dtype=real),
-    ):
+    @row.func
+    def update_node(c, pose, node, grid, grid_v, holds, held_mass, held_by, pairs):
         """v_i = (m v)_i / m_i + dt g where there is mass, then the boundary conditions and contact of bodies.
 
         Held nodes move with their clamp. Their mass becomes -1, so that `grid_adjoint` knows them.
@@ -268,23 +209,8 @@ def forward_functions(dtype: torch.dtype, clamps: bool, bodies: bool) -> SimpleN
                 grid[node] = vec4(real(0.0), real(0.0), real(0.0), real(-1.0))
         grid_v[node] = result
 
-    @wp.func
-    def move_particle(
-        c: GridConstants,
-        now: wp.int32,
-        after: wp.int32,
-        cached: wp.int32,
-        step: wp.int32,
-        p: wp.int32,
-        v_new: vec3,
-        C_new: mat33,
-        x: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        C: wp.array2d(dtype=mat33),
-        F: wp.array2d(dtype=mat33),
-        F_trial: wp.array2d(dtype=mat33),
-        faults: wp.array2d(dtype=wp.int64),
-    ):
+    @typed(dtype, 2).func
+    def move_particle(c, now, after, cached, step, p, v_new: vec3, C_new: mat33, x, v, C, F, F_trial, faults):
         """Set the state of a particle after the step, and flag its faults."""
         x_new = moved(c, x[now, p], v_new)
         x[after, p] = x_new
@@ -310,21 +236,21 @@ def forward_kernels(
     """Kernels `cells`, `p2g`, `grid_update` and `g2p` for a precision, a scatter method and features of the model:
     "contact" of particles, shapes other than planes that they touch, "clamps", and several "bodies"."""
     contact, clamps, bodies = "contact" in features, "clamps" in features, "bodies" in features
-    Hold, held, prescribed = hold_type(dtype), *vars(clamp_functions(dtype)).values()
+    held, prescribed = vars(clamp_functions(dtype)).values()
     t, functions = warp_types(dtype), grid_functions(dtype)
-    Obstacle, touch = obstacle_type(dtype), contact_functions(dtype, features).contact
+    touch = contact_functions(dtype, features).contact
     ordered = scatter != "atomic"
     run_of, deposit = scatter_functions(dtype, scatter, 4)
-    real, vec3, vec4, mat33, mat34, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.mat34, t.GridConstants
+    real, vec3, vec4, mat33 = t.real, t.vec3, t.vec4, t.mat33
     stencil, moments, column = functions.stencil, functions.moments, functions.column
     obstacle_row = functions.obstacle_row
     hold_mass, update_node, move_particle = vars(forward_functions(dtype, clamps, bodies)).values()
     gather, _ = gather_functions(dtype)
     module = f"neuma_lib.sim.forward_{str(dtype).removeprefix('torch.')}_{'_'.join((scatter, *features))}"
-    kernel = functools.partial(wp.kernel, enable_backward=False, module=module)
+    kernel = typed(dtype, 2).kernel(module)
 
     @kernel
-    def cells(c: GridConstants, now: wp.int32, x: wp.array2d(dtype=vec3), cell: wp.array(dtype=wp.int32)):
+    def cells(c, now, x, cell):
         """Index of the first node of a particle's stencil, as a sort key."""
         p = wp.tid()
         first, _, _, _, _ = stencil(c, p, x[now, p])
@@ -332,29 +258,9 @@ def forward_kernels(
 
     @kernel
     def p2g(
-        c: GridConstants,
-        now: wp.int32,
-        cached: wp.int32,
-        sort: wp.int32,
-        pose: wp.int32,
-        after: wp.int32,
-        order: wp.array2d(dtype=wp.int32),
-        x: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        C: wp.array2d(dtype=mat33),
-        tau: wp.array2d(dtype=mat33),
-        mass: wp.array(dtype=real),
-        vol0: wp.array(dtype=real),
-        radius: wp.array(dtype=real),
-        obstacles: wp.array2d(dtype=Obstacle),
-        distances: wp.array(dtype=real),
-        stuck: wp.array2d(dtype=vec3),
-        holds: wp.array2d(dtype=Hold),
-        clamp: wp.array(dtype=wp.int32),
-        held_mass: wp.array(dtype=real),
-        held_by: wp.array(dtype=wp.int32),
-        grid_rows: wp.array2d(dtype=mat34),
-    ):
+        c, now, cached, sort, pose, after, order, x, v, C, tau, mass, vol0, radius, obstacles, distances,
+        stuck, holds, clamp, held_mass, held_by, grid_rows,
+    ):  # fmt: skip
         """m_i += w_i m, (m v)_i += w_i (m v + A d_i) with A = m C - dt vol0 (4/dx^2) tau, d_i = x_i - x.
 
         v is the velocity after contact of particles. The mass of clamped particles goes to held_mass instead.
@@ -396,38 +302,12 @@ def forward_kernels(
             q_i += column(A, 0)
 
     @kernel
-    def grid_update(
-        c: GridConstants,
-        cached: wp.int32,
-        pose: wp.int32,
-        grid: wp.array2d(dtype=vec4),
-        grid_v: wp.array2d(dtype=vec4),
-        holds: wp.array2d(dtype=Hold),
-        held_mass: wp.array(dtype=real),
-        held_by: wp.array(dtype=wp.int32),
-        pairs: wp.array2d(dtype=real),
-    ):
+    def grid_update(c, cached, pose, grid, grid_v, holds, held_mass, held_by, pairs):
         """Velocities of the nodes (`forward_functions`)."""
         update_node(c, pose, wp.tid(), grid[cached], grid_v[cached], holds, held_mass, held_by, pairs)
 
     @kernel
-    def g2p(
-        c: GridConstants,
-        now: wp.int32,
-        after: wp.int32,
-        cached: wp.int32,
-        step: wp.int32,
-        pose: wp.int32,
-        grid_v_rows: wp.array2d(dtype=mat34),
-        x: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        C: wp.array2d(dtype=mat33),
-        F: wp.array2d(dtype=mat33),
-        F_trial: wp.array2d(dtype=mat33),
-        holds: wp.array2d(dtype=Hold),
-        clamp: wp.array(dtype=wp.int32),
-        faults: wp.array2d(dtype=wp.int64),
-    ):
+    def g2p(c, now, after, cached, step, pose, grid_v_rows, x, v, C, F, F_trial, holds, clamp, faults):
         """v = sum w_i v_i,  C = (4/dx^2) sum w_i v_i d_i^T,  x += dt v (bounded),  F_trial = (I + dt C) F.
 
         v and C of clamped particles are those of their clamp.
@@ -460,21 +340,13 @@ def forward_kernels(
 def deformation_kernels(dtype: torch.dtype) -> SimpleNamespace:
     """Kernels `trial_deformation`, `total_adjoint`, `advect_tracers` and `add_gradients` for a precision."""
     t, functions = warp_types(dtype), grid_functions(dtype)
-    real, vec3, vec4, mat33, mat34, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.mat34, t.GridConstants
+    real, vec3, vec4 = t.real, t.vec3, t.vec4
     stencil, moved = functions.stencil, functions.moved
     module = f"neuma_lib.sim.deformation_{str(dtype).removeprefix('torch.')}"
-    kernel = functools.partial(wp.kernel, enable_backward=False, module=module)
+    kernel = typed(dtype, 2).kernel(module)
 
     @kernel
-    def trial_deformation(
-        c: GridConstants,
-        now: wp.int32,
-        after: wp.int32,
-        cached: wp.int32,
-        C: wp.array2d(dtype=mat33),
-        F: wp.array2d(dtype=mat33),
-        F_trial: wp.array2d(dtype=mat33),
-    ):
+    def trial_deformation(c, now, after, cached, C, F, F_trial):
         """F_trial = (I + dt C) F, bit-identical to g2p, for a reverse loop that kept only the states.
 
         With the total deformation for F and F_trial, and `after` for `cached`, it advances the total deformation.
@@ -483,13 +355,7 @@ def deformation_kernels(dtype: torch.dtype) -> SimpleNamespace:
         F_trial[cached, p] = F[now, p] + c.dt * (C[after, p] * F[now, p])
 
     @kernel
-    def advect_tracers(
-        c: GridConstants,
-        cached: wp.int32,
-        grid_v_rows: wp.array2d(dtype=mat34),
-        first_of: wp.array(dtype=wp.int32),
-        x: wp.array(dtype=vec3),
-    ):
+    def advect_tracers(c, cached, grid_v_rows, first_of, x: wp.array(dtype=vec3)):
         """x += dt v, interpolated over nodes with mass of a tracer's body in the first copy.
 
         ``first_of`` has the first particle of that body. A tracer without such nodes stays.
@@ -505,15 +371,7 @@ def deformation_kernels(dtype: torch.dtype) -> SimpleNamespace:
             x[p] = moved(c, xp, vec3(total[0], total[1], total[2]) / total[3])
 
     @kernel
-    def total_adjoint(
-        c: GridConstants,
-        now: wp.int32,
-        after: wp.int32,
-        C: wp.array2d(dtype=mat33),
-        F_total: wp.array2d(dtype=mat33),
-        grad_C: wp.array(dtype=mat33),
-        grad_F_total: wp.array(dtype=mat33),
-    ):
+    def total_adjoint(c, now, after, C, F_total, grad_C, grad_F_total):
         """In place: from the gradient of F_total after the step to those of C (added) and of F_total before it."""
         p = wp.tid()
         g = grad_F_total[p]
@@ -522,15 +380,9 @@ def deformation_kernels(dtype: torch.dtype) -> SimpleNamespace:
 
     @kernel
     def add_gradients(
-        c: GridConstants,
-        frame_of_x: wp.int32,
-        frame_of_F: wp.int32,
-        added_x: wp.array2d(dtype=real),
-        added_F: wp.array2d(dtype=real),
-        grad_F_elastic: wp.array(dtype=real),
-        grad_x: wp.array(dtype=real),
-        grad_F: wp.array(dtype=real),
-    ):
+        c, frame_of_x, frame_of_F, added_x: wp.array2d(dtype=real), added_F: wp.array2d(dtype=real),
+        grad_F_elastic: wp.array(dtype=real), grad_x: wp.array(dtype=real), grad_F: wp.array(dtype=real),
+    ):  # fmt: skip
         """Add the gradient of F from elasticity, and those of x and F at a frame unless its index is -1.
 
         A thread adds single numbers, so that neighbours in a warp access neighbours in memory.

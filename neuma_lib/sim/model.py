@@ -122,6 +122,11 @@ class MPM:
         pairs = tuple(replace(pair, friction=0.0) for pair in self.pairs)
         return replace(self.with_friction(0.0), pairs=pairs)
 
+    def with_pair_frictions(self, frictions: Sequence[float]) -> MPM:
+        """This model with other Coulomb coefficients of its pairs of bodies."""
+        pairs = zip(self.pairs, frictions, strict=True)
+        return replace(self, pairs=tuple(replace(pair, friction=own) for pair, own in pairs))
+
     def with_friction(self, friction: float, given: bool = True) -> MPM:
         """This model with a Coulomb coefficient of all obstacles, or only of those that stick if not ``given``.
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from neuma_lib.errors import NonFiniteError
@@ -43,16 +44,34 @@ def predict(
     Args:
         start: particles and their initial motion.
         frames: simulation steps of the frames, T of them.
-        tracers: start positions of passive tracers [m], shape (M, 3).
+        tracers: start positions of passive tracers [m], shape (M, 3). Each moves with the nearest of several bodies.
         total: also carry the total deformation.
 
     Returns:
         The trajectory at the frames, and the failure or None.
     """
-    return valid_frames(
-        lambda kept: rollout(model, law, start, steps=kept[-1], frames=kept, tracers=tracers, total=total),
-        frames,
-    )
+    by_body, counts = None, ()
+    if tracers is not None and start.bodies:
+        owner = nearest_body(start, tracers).to(tracers.device)
+        by_body, counts = (
+            torch.argsort(owner, stable=True),
+            owner.bincount(minlength=len(start.bodies)).tolist(),
+        )
+        tracers = tracers[by_body]
+
+    def simulate(kept: Sequence[int]) -> Trajectory:
+        options = {"tracers": tracers, "tracer_bodies": counts, "total": total}
+        path = rollout(model, law, start, steps=kept[-1], frames=kept, **options)
+        return path if by_body is None else replace(path, tracers=path.tracers[:, by_body.argsort()])
+
+    return valid_frames(simulate, frames)
+
+
+def nearest_body(start: State, points: Tensor) -> Tensor:
+    """Index of the body whose particle is nearest to each point (M, 3) [m], shape (M,)."""
+    owners = torch.arange(len(start.bodies)).repeat_interleave(torch.tensor(start.bodies))
+    nearest = cKDTree(start.x.detach().cpu().numpy()).query(points.detach().cpu().numpy())[1]
+    return owners[torch.from_numpy(nearest)]
 
 
 def valid_frames(

@@ -21,9 +21,10 @@ from neuma_lib.device import native_source, start_warp
 from neuma_lib.mechanics.singular_values_kernels import MATRICES
 from neuma_lib.sim.adjoint_kernels import adjoint_functions
 from neuma_lib.sim.body_contact import body_functions
-from neuma_lib.sim.clamp_kernels import clamp_functions, hold_type
-from neuma_lib.sim.contact_kernels import contact_functions, obstacle_type
-from neuma_lib.sim.kernels import NO_CONTACT, forward_functions, grid_functions, warp_types
+from neuma_lib.sim.clamp_kernels import clamp_functions
+from neuma_lib.sim.contact_kernels import contact_functions
+from neuma_lib.sim.kernels import NO_CONTACT, forward_functions, grid_functions
+from neuma_lib.sim.warp_types import typed, warp_types
 
 start_warp()
 
@@ -45,8 +46,8 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
     "walls" included, of which a node has a boundary condition, or several bodies."""
     contact, clamps, bodies = "contact" in features, "clamps" in features, "bodies" in features
     special_nodes = clamps or "walls" in features
-    Hold, (held, prescribed) = hold_type(dtype), vars(clamp_functions(dtype)).values()
-    Obstacle, touching = obstacle_type(dtype), contact_functions(dtype, features)
+    held, prescribed = vars(clamp_functions(dtype)).values()
+    touching = contact_functions(dtype, features)
     touch, touch_adjoint = touching.contact, touching.contact_adjoint
     t, functions = warp_types(dtype), grid_functions(dtype)
     real, vec3, vec4, mat33, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.GridConstants
@@ -57,84 +58,41 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
     node_adjoint, deformation_adjoint = adjoint.node_adjoint, adjoint.deformation_adjoint
     moved_mask = functions.moved_mask
     module = f"neuma_lib.sim.transfers_{str(dtype).removeprefix('torch.')}_{'_'.join(features)}"
-    kernel = functools.partial(wp.kernel, enable_backward=False, module=module)
+    kernel, row = typed(dtype, 2).kernel(module), typed(dtype, 1)
 
-    @wp.func_native(_native(dtype, "lanes", "block", "spans", "keep", "momentum", "p2g"))
-    def p2g_loop(
-        c: GridConstants, x: wp.array(dtype=vec3), v: wp.array(dtype=vec3), C: wp.array(dtype=mat33),
-        tau: wp.array(dtype=mat33), mass: wp.array(dtype=real), vol0: wp.array(dtype=real),
-        spans: wp.array(dtype=wp.int32), grid: wp.array2d(dtype=vec4), kept: wp.array(dtype=vec4),
-        kept_spans: wp.array(dtype=wp.int32),
-    ): ...  # fmt: skip
+    @row.func_native(_native(dtype, "lanes", "block", "spans", "keep", "momentum", "p2g"))
+    def p2g_loop(c, x, v, C, tau, mass, vol0, spans, grid: wp.array2d(dtype=vec4), kept, kept_spans): ...
 
-    @wp.func_native(_native(dtype, "spans", "keep", "restore"))
-    def restore_nodes(
-        c: GridConstants, spans: wp.array(dtype=wp.int32), grid: wp.array2d(dtype=vec4), kept: wp.array(dtype=vec4),
-        kept_spans: wp.array(dtype=wp.int32),
-    ) -> wp.int32: ...  # fmt: skip
+    @row.func_native(_native(dtype, "spans", "keep", "restore"))
+    def restore_nodes(c, spans, grid: wp.array2d(dtype=vec4), kept, kept_spans) -> wp.int32: ...
 
-    @wp.func_native(_native(dtype, "grid_update"))
-    def grid_loop(
-        c: GridConstants, spans: wp.array(dtype=wp.int32), grid: wp.array(dtype=vec4), grid_v: wp.array(dtype=vec4)
-    ): ...  # fmt: skip
+    @row.func_native(_native(dtype, "grid_update"))
+    def grid_loop(c, spans, grid, grid_v): ...
 
-    @wp.func_native(_native(dtype, "lanes", "block", "g2p", held=clamps))
-    def g2p_loop(
-        c: GridConstants, step: wp.int32, mass: wp.array(dtype=real), grid_v: wp.array(dtype=vec4),
-        x: wp.array(dtype=vec3), F: wp.array(dtype=mat33), x_after: wp.array(dtype=vec3),
-        v_after: wp.array(dtype=vec3), C_after: wp.array(dtype=mat33), F_trial: wp.array(dtype=mat33),
-        faults: wp.array2d(dtype=wp.int64),
-    ): ...  # fmt: skip
+    @row.func_native(_native(dtype, "lanes", "block", "g2p", held=clamps))
+    def g2p_loop(c, step, mass, grid_v, x, F, x_after, v_after, C_after, F_trial, faults): ...
 
-    @wp.func_native(_native(dtype, "lanes", "block", "advect"))
-    def advect_loop(
-        c: GridConstants, grid_v: wp.array(dtype=vec4), first_of: wp.array(dtype=wp.int32), x: wp.array(dtype=vec3)
-    ): ...  # fmt: skip
+    @row.func_native(_native(dtype, "lanes", "block", "advect"))
+    def advect_loop(c, grid_v, first_of, x): ...
 
-    @wp.func_native(_native(dtype, "lanes", "trial"))
-    def trial_loop(
-        c: GridConstants, C_after: wp.array(dtype=mat33), F: wp.array(dtype=mat33), F_trial: wp.array(dtype=mat33)
-    ): ...  # fmt: skip
+    @row.func_native(_native(dtype, "lanes", "trial"))
+    def trial_loop(c, C_after, F, F_trial): ...
 
-    @wp.func_native(_native(dtype, "lanes", "block", "g2p_adjoint", held=clamps))
+    @row.func_native(_native(dtype, "lanes", "block", "g2p_adjoint", held=clamps))
     def g2p_adjoint_loop(
-        c: GridConstants, mass: wp.array(dtype=real), grid_v: wp.array(dtype=vec4), x: wp.array(dtype=vec3),
-        F: wp.array(dtype=mat33), x_after: wp.array(dtype=vec3), v_after: wp.array(dtype=vec3),
-        C_after: wp.array(dtype=mat33), grad_v: wp.array(dtype=vec3), grad_C: wp.array(dtype=mat33),
-        grad_F_trial: wp.array(dtype=mat33), grad_x: wp.array(dtype=vec3), grad_F: wp.array(dtype=mat33),
-        grad_grid: wp.array(dtype=vec4),
+        c, mass, grid_v, x, F, x_after, v_after, C_after, grad_v, grad_C, grad_F_trial, grad_x, grad_F,
+        grad_grid,
     ): ...  # fmt: skip
 
-    @wp.func_native(_native(dtype, "grid_adjoint"))
-    def grid_adjoint_loop(
-        c: GridConstants, spans: wp.array(dtype=wp.int32), grid: wp.array(dtype=vec4),
-        grad_grid: wp.array(dtype=vec4),
-    ): ...  # fmt: skip
+    @row.func_native(_native(dtype, "grid_adjoint"))
+    def grid_adjoint_loop(c, spans, grid, grad_grid): ...
 
-    @wp.func_native(_native(dtype, "lanes", "block", "momentum", "p2g_adjoint"))
-    def p2g_adjoint_loop(
-        c: GridConstants, x: wp.array(dtype=vec3), v: wp.array(dtype=vec3), C: wp.array(dtype=mat33),
-        tau: wp.array(dtype=mat33), mass: wp.array(dtype=real), vol0: wp.array(dtype=real),
-        grad_grid: wp.array(dtype=vec4), grad_x: wp.array(dtype=vec3), grad_v: wp.array(dtype=vec3),
-        grad_C: wp.array(dtype=mat33), grad_tau: wp.array(dtype=mat33),
-    ): ...  # fmt: skip
+    @row.func_native(_native(dtype, "lanes", "block", "momentum", "p2g_adjoint"))
+    def p2g_adjoint_loop(c, x, v, C, tau, mass, vol0, grad_grid, grad_x, grad_v, grad_C, grad_tau): ...
 
     @kernel
     def hold(
-        c: GridConstants,
-        now: wp.int32,
-        pose: wp.int32,
-        x: wp.array2d(dtype=vec3),
-        mass: wp.array(dtype=real),
-        vol0: wp.array(dtype=real),
-        radius: wp.array(dtype=real),
-        holds: wp.array2d(dtype=Hold),
-        clamp: wp.array(dtype=wp.int32),
-        mass_now: wp.array(dtype=real),
-        vol_now: wp.array(dtype=real),
-        radius_now: wp.array(dtype=real),
-        held_mass: wp.array(dtype=real),
-        held_by: wp.array(dtype=wp.int32),
+        c, now, pose, x, mass, vol0, radius, holds, clamp, mass_now, vol_now, radius_now, held_mass, held_by
     ):
         """Mass, volume and radius of particles as the grid and colliders see them, and the mass of held ones."""
         p = wp.tid()
@@ -147,34 +105,15 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
             vol_now[p] = real(0.0)
             radius_now[p] = real(wp.static(NO_CONTACT))
 
-    @wp.func_native(_native(dtype, "lanes", "near"))
-    def near_obstacles(
-        c: GridConstants, others: wp.int32, again: wp.int32, x: wp.array(dtype=vec3), v: wp.array(dtype=vec3),
-        radius: wp.array(dtype=real), v_now: wp.array(dtype=vec3), stuck: wp.array(dtype=vec3),
-        near: wp.array(dtype=wp.int32),
-    ) -> wp.int32: ...  # fmt: skip
+    @row.func_native(_native(dtype, "lanes", "near"))
+    def near_obstacles(c, others, again, x, v, radius, v_now, stuck, near) -> wp.int32: ...
 
-    @wp.func_native(_native(dtype, "far"))
-    def clear_far(
-        c: GridConstants, near: wp.array(dtype=wp.int32), count: wp.int32, grad_stuck: wp.array(dtype=vec3)
-    ): ...
+    @row.func_native(_native(dtype, "far"))
+    def clear_far(c, near, count, grad_stuck): ...
 
     @kernel
     def touch_obstacles(
-        c: GridConstants,
-        now: wp.int32,
-        after: wp.int32,
-        pose: wp.int32,
-        again: wp.int32,
-        x: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        radius_now: wp.array(dtype=real),
-        obstacles: wp.array2d(dtype=Obstacle),
-        distances: wp.array(dtype=real),
-        stuck: wp.array2d(dtype=vec3),
-        v_now: wp.array(dtype=vec3),
-        near: wp.array(dtype=wp.int32),
-        touching: wp.array(dtype=wp.int32),
+        c, now, after, pose, again, x, v, radius_now, obstacles, distances, stuck, v_now, near, touching
     ):
         """Velocities of the particles after contact with obstacles, if one touches.
 
@@ -199,24 +138,9 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
 
     @kernel
     def p2g(
-        c: GridConstants,
-        now: wp.int32,
-        stressed: wp.int32,
-        cached: wp.int32,
-        again: wp.int32,
-        x: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        C: wp.array2d(dtype=mat33),
-        tau: wp.array2d(dtype=mat33),
-        mass_now: wp.array(dtype=real),
-        vol_now: wp.array(dtype=real),
-        v_now: wp.array(dtype=vec3),
-        touching: wp.array(dtype=wp.int32),
-        spans: wp.array(dtype=wp.int32),
-        grids: wp.array2d(dtype=vec4),
-        kept: wp.array2d(dtype=vec4),
-        kept_spans: wp.array2d(dtype=wp.int32),
-    ):
+        c, now, stressed, cached, again, x, v, C, tau, mass_now, vol_now, v_now, touching, spans, grids,
+        kept, kept_spans,
+    ):  # fmt: skip
         """As `kernels.p2g`, and clears all grids before. ``again``: from the nodes that the first time has kept, if it
         has."""
         if again == 1:
@@ -231,16 +155,7 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         )  # fmt: skip
 
     @kernel
-    def grid_update(
-        c: GridConstants,
-        pose: wp.int32,
-        spans: wp.array(dtype=wp.int32),
-        grids: wp.array2d(dtype=vec4),
-        holds: wp.array2d(dtype=Hold),
-        held_mass: wp.array(dtype=real),
-        held_by: wp.array(dtype=wp.int32),
-        pairs: wp.array2d(dtype=real),
-    ):
+    def grid_update(c, pose, spans, grids, holds, held_mass, held_by, pairs):
         """As `kernels.grid_update`, for the nodes of the spans."""
         if wp.static(special_nodes):
             lines = c.n * c.n
@@ -262,66 +177,24 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
                     grids[1, node] = grids[1, node] + vec4(j[0], j[1], j[2], real(0.0))
 
     @kernel
-    def g2p(
-        c: GridConstants,
-        now: wp.int32,
-        after: wp.int32,
-        cached: wp.int32,
-        step: wp.int32,
-        grids: wp.array2d(dtype=vec4),
-        mass_now: wp.array(dtype=real),
-        x: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        C: wp.array2d(dtype=mat33),
-        F: wp.array2d(dtype=mat33),
-        F_trial: wp.array2d(dtype=mat33),
-        faults: wp.array2d(dtype=wp.int64),
-    ):
+    def g2p(c, now, after, cached, step, grids, mass_now, x, v, C, F, F_trial, faults):
         """As `kernels.g2p`, for particles that are not clamped."""
         g2p_loop(
             c, step, mass_now, grids[1], x[now], F[now], x[after], v[after], C[after], F_trial[cached], faults
         )
 
     @kernel
-    def advect_tracers(
-        c: GridConstants,
-        grids: wp.array2d(dtype=vec4),
-        first_of: wp.array(dtype=wp.int32),
-        x: wp.array(dtype=vec3),
-    ):
+    def advect_tracers(c, grids, first_of, x: wp.array(dtype=vec3)):
         """As `kernels.advect_tracers`."""
         advect_loop(c, grids[1], first_of, x)
 
     @kernel
-    def trial_deformation(
-        c: GridConstants,
-        now: wp.int32,
-        after: wp.int32,
-        cached: wp.int32,
-        C: wp.array2d(dtype=mat33),
-        F: wp.array2d(dtype=mat33),
-        F_trial: wp.array2d(dtype=mat33),
-    ):
+    def trial_deformation(c, now, after, cached, C, F, F_trial):
         """As `kernels.trial_deformation`, with the same bytes as g2p."""
         trial_loop(c, C[after], F[now], F_trial[cached])
 
     @kernel
-    def move_held(
-        c: GridConstants,
-        now: wp.int32,
-        after: wp.int32,
-        cached: wp.int32,
-        step: wp.int32,
-        pose: wp.int32,
-        x: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        C: wp.array2d(dtype=mat33),
-        F: wp.array2d(dtype=mat33),
-        F_trial: wp.array2d(dtype=mat33),
-        holds: wp.array2d(dtype=Hold),
-        clamp: wp.array(dtype=wp.int32),
-        faults: wp.array2d(dtype=wp.int64),
-    ):
+    def move_held(c, now, after, cached, step, pose, x, v, C, F, F_trial, holds, clamp, faults):
         """As `kernels.g2p`, for clamped particles."""
         p = wp.tid()
         if held(holds, pose, clamp[p]):
@@ -330,22 +203,7 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
             move_particle(c, now, after, cached, step, p, v_p, C_p, x, v, C, F, F_trial, faults)
 
     @kernel
-    def g2p_adjoint(
-        c: GridConstants,
-        now: wp.int32,
-        after: wp.int32,
-        grids: wp.array2d(dtype=vec4),
-        mass_now: wp.array(dtype=real),
-        x: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        C: wp.array2d(dtype=mat33),
-        F: wp.array2d(dtype=mat33),
-        grad_v: wp.array(dtype=vec3),
-        grad_C: wp.array(dtype=mat33),
-        grad_F_trial: wp.array(dtype=mat33),
-        grad_x: wp.array(dtype=vec3),
-        grad_F: wp.array(dtype=mat33),
-    ):
+    def g2p_adjoint(c, now, after, grids, mass_now, x, v, C, F, grad_v, grad_C, grad_F_trial, grad_x, grad_F):
         """As `adjoint_kernels.g2p_adjoint`, for particles that are not clamped."""
         g2p_adjoint_loop(
             c, mass_now, grids[1], x[now], F[now], x[after], v[after], C[after], grad_v, grad_C, grad_F_trial,
@@ -353,19 +211,7 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         )  # fmt: skip
 
     @kernel
-    def held_adjoint(
-        c: GridConstants,
-        after: wp.int32,
-        pose: wp.int32,
-        x: wp.array2d(dtype=vec3),
-        C: wp.array2d(dtype=mat33),
-        grad_v: wp.array(dtype=vec3),
-        grad_F_trial: wp.array(dtype=mat33),
-        grad_x: wp.array(dtype=vec3),
-        grad_F: wp.array(dtype=mat33),
-        holds: wp.array2d(dtype=Hold),
-        clamp: wp.array(dtype=wp.int32),
-    ):
+    def held_adjoint(c, after, pose, x, C, grad_v, grad_F_trial, grad_x, grad_F, holds, clamp):
         """As `adjoint_kernels.g2p_adjoint`, for clamped particles."""
         p = wp.tid()
         if held(holds, pose, clamp[p]):
@@ -374,13 +220,7 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
             grad_x[p] = g_x + wp.transpose(holds[pose, clamp[p]].A) * (grad_v[p] + c.dt * g_x)
 
     @kernel
-    def grid_adjoint(
-        c: GridConstants,
-        spans: wp.array(dtype=wp.int32),
-        grids: wp.array2d(dtype=vec4),
-        grad_before: wp.array(dtype=vec4),
-        grad_around: wp.array(dtype=vec4),
-    ):
+    def grid_adjoint(c, spans, grids, grad_before, grad_around):
         """As `adjoint_kernels.grid_adjoint`, for the nodes of the spans."""
         if wp.static(special_nodes or bodies):
             lines = c.n * c.n
@@ -393,23 +233,9 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
 
     @kernel
     def p2g_adjoint(
-        c: GridConstants,
-        now: wp.int32,
-        stressed: wp.int32,
-        x: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        C: wp.array2d(dtype=mat33),
-        tau: wp.array2d(dtype=mat33),
-        mass_now: wp.array(dtype=real),
-        vol_now: wp.array(dtype=real),
-        v_now: wp.array(dtype=vec3),
-        touching: wp.array(dtype=wp.int32),
-        grids: wp.array2d(dtype=vec4),
-        grad_x: wp.array(dtype=vec3),
-        grad_v: wp.array(dtype=vec3),
-        grad_C: wp.array(dtype=mat33),
-        grad_tau: wp.array(dtype=mat33),
-    ):
+        c, now, stressed, x, v, C, tau, mass_now, vol_now, v_now, touching, grids, grad_x, grad_v, grad_C,
+        grad_tau,
+    ):  # fmt: skip
         """As `adjoint_kernels.p2g_adjoint` without contact: grad_v is that of the velocity after it."""
         v_p = v[now]
         if wp.static(contact):
@@ -421,21 +247,9 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
 
     @kernel
     def touch_adjoint_kernel(
-        c: GridConstants,
-        now: wp.int32,
-        pose: wp.int32,
-        x: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        radius_now: wp.array(dtype=real),
-        obstacles: wp.array2d(dtype=Obstacle),
-        distances: wp.array(dtype=real),
-        stuck: wp.array2d(dtype=vec3),
-        near: wp.array(dtype=wp.int32),
-        touching: wp.array(dtype=wp.int32),
-        grad_x: wp.array(dtype=vec3),
-        grad_v: wp.array(dtype=vec3),
-        grad_stuck: wp.array(dtype=vec3),
-    ):
+        c, now, pose, x, v, radius_now, obstacles, distances, stuck, near, touching, grad_x, grad_v,
+        grad_stuck,
+    ):  # fmt: skip
         """From gradients of velocity and displacement after contact to those of x (added), v and stuck (set)."""
         for q in range(touching[0]):
             p = near[q]
@@ -448,7 +262,7 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
             grad_stuck[p] = g_s
         clear_far(c, near, touching[0], grad_stuck)
 
-    @wp.func_native(
+    @row.func_native(
         """
     for (int k = 0; k < 9 * added.shape[0]; ++k) ((REAL*)total.data)[k] += ((const REAL*)added.data)[k];
     """.replace("REAL", {torch.float32: "float", torch.float64: "double"}[dtype])
@@ -456,7 +270,7 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
     def add_loop(added: wp.array(dtype=mat33), total: wp.array(dtype=mat33)): ...
 
     @kernel
-    def add(c: GridConstants, grad_F_elastic: wp.array(dtype=mat33), grad_F: wp.array(dtype=mat33)):
+    def add(c, grad_F_elastic, grad_F):
         add_loop(grad_F_elastic, grad_F)
 
     body_contact_adjoint = None
@@ -464,14 +278,7 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         contact_adjoint = body_functions(dtype, GridConstants).adjoint
 
         @kernel
-        def body_contact_adjoint(
-            c: GridConstants,
-            spans: wp.array(dtype=wp.int32),
-            grids: wp.array2d(dtype=vec4),
-            pairs: wp.array2d(dtype=real),
-            grad_before: wp.array(dtype=vec4),
-            grad_around: wp.array(dtype=vec4),
-        ):
+        def body_contact_adjoint(c, spans, grids, pairs, grad_before, grad_around):
             """As `adjoint_kernels.body_contact_adjoint`, for the nodes of the spans."""
             lines = c.n * c.n
             for row in range(c.fields * lines):

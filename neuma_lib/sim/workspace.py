@@ -24,9 +24,10 @@ from neuma_lib.sim.clamp_kernels import hold_type, holds
 from neuma_lib.sim.colliders import SIZES, contact_radius
 from neuma_lib.sim.contact_kernels import STICKING, distances, obstacle_type, obstacles
 from neuma_lib.sim.graphs import MAX_GRAPHS, GraphCache
-from neuma_lib.sim.kernels import NO_FAULT, deformation_kernels, forward_kernels, warp_types
+from neuma_lib.sim.kernels import NO_FAULT, deformation_kernels, forward_kernels
 from neuma_lib.sim.model import MPM, WALLS
 from neuma_lib.sim.native import NativeTransfers
+from neuma_lib.sim.warp_types import warp_types
 from neuma_lib.threads import thread_count
 
 SORT_EVERY = 16

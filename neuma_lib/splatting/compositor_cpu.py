@@ -14,7 +14,7 @@ from types import SimpleNamespace
 import torch
 import warp as wp
 
-from neuma_lib.device import launch, native_source, start_warp
+from neuma_lib.device import launch, native_source, start_warp, typed
 from neuma_lib.splatting.compositing import Settings
 from neuma_lib.splatting.projection import CULLED
 from neuma_lib.splatting.records import SPLAT_SIZE
@@ -108,171 +108,98 @@ def kernels(dtype: torch.dtype):
     """Kernels ``draw``, ``draw_adjoint``, ``compare``, ``compare_adjoint`` of a dtype, CPU only. A thread processes an
     image; Warp runs them one after the other."""
     real = wp.dtype_from_torch(dtype)
-    module = wp.get_module(f"{__name__}.{str(dtype).removeprefix('torch.')}")
+    types = {
+        "background": wp.array(dtype=real),  # (3,)
+        "splats": wp.array3d(dtype=real),  # (I, G, SPLAT_SIZE)
+        "depths": wp.array2d(dtype=real),  # (I, G)
+        "spare": wp.array(dtype=int),
+        "corners": wp.array2d(dtype=real),
+        "order": wp.array2d(dtype=int),  # (I, G), out: the splats that are not culled by depth
+        "numbers": wp.array(dtype=int),  # (I,), out: their number
+        "ends": wp.array2d(dtype=int),  # (I, tiles), out
+        "planes": wp.array4d(
+            dtype=real
+        ),  # (I, tiles, PLANES, TILE^2), out; differences of colours in `compare`
+        "pictures": wp.array4d(dtype=real),  # (I, H, W, 3), out
+        "alphas": wp.array3d(dtype=real),  # (I, H, W), out
+        "observed": wp.array3d(dtype=int),  # (I, H, W)
+        "sums": wp.array(dtype=wp.float64),  # (I,), out
+        "scales": wp.array(dtype=real),  # (I,)
+        "scratch": wp.array3d(dtype=real),  # (tiles, PLANES, TILE^2)
+        "grad_splats": wp.array3d(dtype=real),  # (I, G, SPLAT_SIZE), out
+        "grad_pictures": wp.array4d(dtype=real),  # (I, H, W, 3)
+        "grad_alphas": wp.array3d(dtype=real),  # (I, H, W)
+        "opacities": bool,
+        **dict.fromkeys(("image", "count", "height", "width"), int),
+        **dict.fromkeys(("alpha_min", "alpha_max", "transmittance_min", "back0", "back1", "back2"), real),
+    }
+    own = typed(types)
+    kernel = own.kernel(wp.get_module(f"{__name__}.{str(dtype).removeprefix('torch.')}"))
+    forward = dict(SPLATS_LOOP="splats", START="", BODY="forward_body", FINISH="")
+    backward = dict(SPLATS_LOOP="splats", START="sums", BODY="backward_body", FINISH="gradients")
 
-    @wp.func_native(
-        source(
-            dtype, "rank", "forward", "draw", SPLATS_LOOP="splats", START="", BODY="forward_body", FINISH=""
-        )
-    )
+    @own.func_native(source(dtype, "rank", "forward", "draw", **forward))
     def draw_image(
-        image: int, count: int, height: int, width: int,
-        splats: wp.array3d(dtype=real), depths: wp.array2d(dtype=real),
-        alpha_min: real, alpha_max: real, transmittance_min: real, back0: real, back1: real, back2: real,
-        spare: wp.array(dtype=int), corners: wp.array2d(dtype=real), order: wp.array2d(dtype=int),
-        numbers: wp.array(dtype=int), ends: wp.array2d(dtype=int), planes: wp.array4d(dtype=real),
-        pictures: wp.array4d(dtype=real), alphas: wp.array3d(dtype=real),
+        image, count, height, width, splats, depths, alpha_min, alpha_max, transmittance_min, back0, back1, back2,
+        spare, corners, order, numbers, ends, planes, pictures, alphas,
     ): ...  # fmt: skip
 
-    @wp.func_native(
-        source(
-            dtype,
-            "rank",
-            "forward",
-            "compare",
-            SPLATS_LOOP="splats",
-            START="",
-            BODY="forward_body",
-            FINISH="",
-        )
-    )
+    @own.func_native(source(dtype, "rank", "forward", "compare", **forward))
     def compare_image(
-        image: int, count: int, height: int, width: int,
-        splats: wp.array3d(dtype=real), depths: wp.array2d(dtype=real),
-        alpha_min: real, alpha_max: real, transmittance_min: real, back0: real, back1: real, back2: real,
-        spare: wp.array(dtype=int), corners: wp.array2d(dtype=real), order: wp.array2d(dtype=int),
-        numbers: wp.array(dtype=int), ends: wp.array2d(dtype=int), planes: wp.array4d(dtype=real),
-        observed: wp.array3d(dtype=int), sums: wp.array(dtype=wp.float64),
+        image, count, height, width, splats, depths, alpha_min, alpha_max, transmittance_min, back0, back1, back2,
+        spare, corners, order, numbers, ends, planes, observed, sums,
     ): ...  # fmt: skip
 
-    @wp.func_native(
-        source(
-            dtype,
-            "backward",
-            GRADIENTS="image_gradients",
-            SPLATS_LOOP="splats",
-            START="sums",
-            BODY="backward_body",
-            FINISH="gradients",
-        )
-    )
+    @own.func_native(source(dtype, "backward", GRADIENTS="image_gradients", **backward))
     def draw_image_adjoint(
-        image: int, count: int, height: int, width: int,
-        splats: wp.array3d(dtype=real), alpha_min: real, alpha_max: real, back0: real, back1: real, back2: real,
-        order: wp.array2d(dtype=int), numbers: wp.array(dtype=int), ends: wp.array2d(dtype=int),
-        planes: wp.array4d(dtype=real), opacities: bool, spare: wp.array(dtype=int),
-        corners: wp.array2d(dtype=real), scratch: wp.array3d(dtype=real), grad_splats: wp.array3d(dtype=real),
-        grad_pictures: wp.array4d(dtype=real), grad_alphas: wp.array3d(dtype=real),
+        image, count, height, width, splats, alpha_min, alpha_max, back0, back1, back2, order, numbers, ends, planes,
+        opacities, spare, corners, scratch, grad_splats, grad_pictures, grad_alphas,
     ): ...  # fmt: skip
 
-    @wp.func_native(
-        source(
-            dtype,
-            "backward",
-            GRADIENTS="error_gradients",
-            SPLATS_LOOP="splats",
-            START="sums",
-            BODY="backward_body",
-            FINISH="gradients",
-        )
-    )
+    @own.func_native(source(dtype, "backward", GRADIENTS="error_gradients", **backward))
     def compare_image_adjoint(
-        image: int, count: int, height: int, width: int,
-        splats: wp.array3d(dtype=real), alpha_min: real, alpha_max: real, back0: real, back1: real, back2: real,
-        order: wp.array2d(dtype=int), numbers: wp.array(dtype=int), ends: wp.array2d(dtype=int),
-        planes: wp.array4d(dtype=real), opacities: bool, spare: wp.array(dtype=int),
-        corners: wp.array2d(dtype=real), scratch: wp.array3d(dtype=real), grad_splats: wp.array3d(dtype=real),
-        scales: wp.array(dtype=real),
+        image, count, height, width, splats, alpha_min, alpha_max, back0, back1, back2, order, numbers, ends, planes,
+        opacities, spare, corners, scratch, grad_splats, scales,
     ): ...  # fmt: skip
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel
     def draw(
-        splats: wp.array3d(dtype=real),  # (I, G, SPLAT_SIZE)
-        depths: wp.array2d(dtype=real),  # (I, G)
-        alpha_min: real,
-        alpha_max: real,
-        transmittance_min: real,
-        background: wp.array(dtype=real),  # (3,)
-        spare: wp.array(dtype=int),
-        corners: wp.array2d(dtype=real),
-        order: wp.array2d(dtype=int),  # (I, G), out: the splats that are not culled by depth
-        numbers: wp.array(dtype=int),  # (I,), out: their number
-        ends: wp.array2d(dtype=int),  # (I, tiles), out
-        planes: wp.array4d(dtype=real),  # (I, tiles, PLANES, TILE^2), out
-        pictures: wp.array4d(dtype=real),  # (I, H, W, 3), out
-        alphas: wp.array3d(dtype=real),  # (I, H, W), out
-    ):
+        splats, depths, alpha_min, alpha_max, transmittance_min, background, spare, corners, order, numbers, ends,
+        planes, pictures, alphas,
+    ):  # fmt: skip
         draw_image(
             wp.tid(), splats.shape[1], alphas.shape[1], alphas.shape[2], splats, depths, alpha_min, alpha_max,
             transmittance_min, background[0], background[1], background[2], spare, corners, order, numbers, ends,
             planes, pictures, alphas,
         )  # fmt: skip
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel
     def compare(
-        splats: wp.array3d(dtype=real),  # (I, G, SPLAT_SIZE)
-        depths: wp.array2d(dtype=real),  # (I, G)
-        alpha_min: real,
-        alpha_max: real,
-        transmittance_min: real,
-        background: wp.array(dtype=real),  # (3,)
-        spare: wp.array(dtype=int),
-        corners: wp.array2d(dtype=real),
-        order: wp.array2d(dtype=int),  # (I, G), out
-        numbers: wp.array(dtype=int),  # (I,), out
-        ends: wp.array2d(dtype=int),  # (I, tiles), out
-        planes: wp.array4d(dtype=real),  # (I, tiles, PLANES, TILE^2), out: differences instead of colours
-        observed: wp.array3d(dtype=int),  # (I, H, W)
-        sums: wp.array(dtype=wp.float64),  # (I,), out
-    ):
+        splats, depths, alpha_min, alpha_max, transmittance_min, background, spare, corners, order, numbers, ends,
+        planes, observed, sums,
+    ):  # fmt: skip
         compare_image(
             wp.tid(), splats.shape[1], observed.shape[1], observed.shape[2], splats, depths, alpha_min, alpha_max,
             transmittance_min, background[0], background[1], background[2], spare, corners, order, numbers, ends,
             planes, observed, sums,
         )  # fmt: skip
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel
     def draw_adjoint(
-        splats: wp.array3d(dtype=real),  # (I, G, SPLAT_SIZE)
-        alpha_min: real,
-        alpha_max: real,
-        background: wp.array(dtype=real),  # (3,)
-        order: wp.array2d(dtype=int),  # (I, G)
-        numbers: wp.array(dtype=int),  # (I,)
-        ends: wp.array2d(dtype=int),  # (I, tiles)
-        planes: wp.array4d(dtype=real),  # (I, tiles, PLANES, TILE^2)
-        grad_pictures: wp.array4d(dtype=real),  # (I, H, W, 3)
-        grad_alphas: wp.array3d(dtype=real),  # (I, H, W)
-        spare: wp.array(dtype=int),
-        corners: wp.array2d(dtype=real),
-        scratch: wp.array3d(dtype=real),  # (tiles, PLANES, TILE^2)
-        grad_splats: wp.array3d(dtype=real),  # (I, G, SPLAT_SIZE), out
-    ):
+        splats, alpha_min, alpha_max, background, order, numbers, ends, planes, grad_pictures, grad_alphas, spare,
+        corners, scratch, grad_splats,
+    ):  # fmt: skip
         draw_image_adjoint(
             wp.tid(), splats.shape[1], grad_alphas.shape[1], grad_alphas.shape[2], splats, alpha_min, alpha_max,
             background[0], background[1], background[2], order, numbers, ends, planes, True, spare, corners,
             scratch, grad_splats, grad_pictures, grad_alphas,
         )  # fmt: skip
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel
     def compare_adjoint(
-        splats: wp.array3d(dtype=real),  # (I, G, SPLAT_SIZE)
-        alpha_min: real,
-        alpha_max: real,
-        background: wp.array(dtype=real),  # (3,)
-        order: wp.array2d(dtype=int),  # (I, G)
-        numbers: wp.array(dtype=int),  # (I,)
-        ends: wp.array2d(dtype=int),  # (I, tiles)
-        planes: wp.array4d(dtype=real),  # (I, tiles, PLANES, TILE^2), result of `compare`
-        width: int,
-        height: int,
-        scales: wp.array(dtype=real),  # (I,)
-        opacities: bool,
-        spare: wp.array(dtype=int),
-        corners: wp.array2d(dtype=real),
-        scratch: wp.array3d(dtype=real),  # (tiles, PLANES, TILE^2)
-        grad_splats: wp.array3d(dtype=real),  # (I, G, SPLAT_SIZE), out
-    ):
+        splats, alpha_min, alpha_max, background, order, numbers, ends, planes, width, height, scales, opacities,
+        spare, corners, scratch, grad_splats,
+    ):  # fmt: skip
         compare_image_adjoint(
             wp.tid(), splats.shape[1], height, width, splats, alpha_min, alpha_max, background[0], background[1],
             background[2], order, numbers, ends, planes, opacities, spare, corners, scratch, grad_splats, scales,

@@ -1,4 +1,4 @@
-"""Division of Gaussians into bodies by labelled images."""
+"""Division of Gaussians into bodies by labelled images, and the bodies behind others."""
 
 from __future__ import annotations
 
@@ -14,6 +14,9 @@ from neuma_lib.splatting.spherical_harmonics import SH_C0
 
 MIN_WEIGHT = 0.1
 """Least weight [px] with which a Gaussian must be visible in all images together to be assigned by them."""
+
+
+_MIN_ALPHA = 1e-6  # keeps colours of empty pixels finite
 
 
 def bodies_of(gaussians: Gaussians, cameras: Cameras, labels: Tensor, count: int) -> Tensor:
@@ -62,3 +65,22 @@ def bodies_of(gaussians: Gaussians, cameras: Cameras, labels: Tensor, count: int
     visible = seen.cpu().numpy()
     nearest = torch.from_numpy(cKDTree(points[visible]).query(points[~visible])[1]).to(body)
     return body.index_put((~seen,), body[seen][nearest])
+
+
+def without_others(gaussians: Gaussians, cameras: Cameras, images: Tensor, hidden: Tensor) -> Tensor:
+    """Images of a body, completed where others hide it by renders of its Gaussians, shape (V, H, W, 4).
+
+    Args:
+        gaussians: those of the body.
+        cameras: V cameras.
+        images: straight-alpha RGBA in [0, 1] of its visible part, shape (V, H, W, 4).
+        hidden: pixels that show another body, shape (V, H, W).
+    """
+    with torch.no_grad():
+        colours, alpha = rasterize(
+            gaussians.means[None], gaussians.covars()[None], gaussians.opacities, gaussians.sh(), cameras.viewmats,
+            cameras.Ks, cameras.width, cameras.height, background=(0, 0, 0), eps2d=0.0,
+        )  # fmt: skip
+    coverage = alpha[0, ..., None]
+    rendered = torch.cat([colours[0] / coverage.clamp_min(_MIN_ALPHA), coverage], dim=-1)
+    return torch.where(hidden[..., None], rendered.clamp(0, 1), images)

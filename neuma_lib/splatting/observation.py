@@ -36,6 +36,8 @@ class Observation:
         cameras: the V views; colours have their dtype.
         exposure: steps whose renders are averaged to a frame, relative to its step, ascending; (0,): no motion blur.
         shares: weights of those renders, which sum to 1; None: equal weights.
+        hidden: pixels in which another body hides the observed one, which are empty, shape (T, V, H, W); None: nothing
+            hides it.
     """
 
     frames: tuple[int, ...]
@@ -43,6 +45,7 @@ class Observation:
     cameras: Cameras
     exposure: tuple[int, ...] = (0,)
     shares: tuple[float, ...] | None = None
+    hidden: Tensor | None = None
 
     def __post_init__(self):
         if len(self.frames) != len(self.images):
@@ -57,6 +60,9 @@ class Observation:
                 f" {width}x{height} pixels",
                 "Use RGBA as uint8 or RGB as floats, shape (T, V, H, W, channels)",
             )
+        if self.hidden is not None and self.hidden.shape != self.images.shape[:-1]:
+            expected = f"{tuple(self.images.shape[:-1])}, as the images"
+            raise InputError("observation: hidden", f"has shape {tuple(self.hidden.shape)}, not {expected}")
         if list(self.frames) != sorted(set(self.frames)):
             raise InputError("observation: frames", f"must be strictly ascending, not {self.frames}")
         exposure = self.exposure
@@ -98,7 +104,9 @@ class Observation:
     def select(self, keep: Sequence[int]) -> Observation:
         """The frames with the given indices."""
         keep = list(keep)
-        return replace(self, frames=tuple(self.frames[i] for i in keep), images=self.images[keep])
+        hidden = None if self.hidden is None else self.hidden[keep]
+        frames = tuple(self.frames[i] for i in keep)
+        return replace(self, frames=frames, images=self.images[keep], hidden=hidden)
 
     def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> Observation:
         """The same frames on another device, with another dtype of cameras and colours.

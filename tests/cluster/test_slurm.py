@@ -16,7 +16,7 @@ import pytest
 import torch
 
 from neuma_lib.io.weights import read_torch
-from neuma_lib.project.timings import core_seconds
+from neuma_lib.project.timings import used
 from tests.support.project import SCENE, TABLE, Project, copied, wait_for
 
 # Table 1 with a training that is long enough to be cancelled in the middle; all before it is there.
@@ -106,7 +106,7 @@ def test_every_job_ends_well_and_its_log_arrives(finished, slurm):
     logs = [*(finished.root / "tiny").rglob("*.log")]
     assert len(logs) == len(ran)
     for log in logs:
-        assert core_seconds(log), log
+        assert used(log), log
     # SLURM's own logs of jobs that ended well are removed by the plugin.
     assert not [*(finished.root / ".snakemake/slurm_logs").rglob("*.log")]
 
@@ -234,7 +234,7 @@ def test_all_of_a_scene_may_be_one_job(clone, slurm):
     assert clone.artifacts() == before
     kept = {name for name, time in made(clone).items() if times[name] == time}
     assert kept and all("/kernels/" in name or "/priors/" in name for name in kept)
-    assert all(core_seconds(log) for log in (clone.root / "tiny").rglob("*.log"))
+    assert all(used(log) for log in (clone.root / "tiny").rglob("*.log"))
 
 
 # ---- GPUs

@@ -19,7 +19,7 @@ from neuma_lib.fitting.families import MAX_COURANT, Family
 from neuma_lib.fitting.family_run import FamilyRun
 from neuma_lib.fitting.frame_batches import check_contact, first_contact
 from neuma_lib.fitting.identified import FamilyFit, Identified
-from neuma_lib.fitting.identify import _better_later, _first_fit, _prune, _select, identify
+from neuma_lib.fitting.identify import _better_later, _first_fit, _prune, identify, select_family
 from neuma_lib.fitting.least_squares import (
     BLOCKS,
     Linearisation,
@@ -539,7 +539,7 @@ def test_a_plateau_widens_what_is_not_determined(flat):
     """Squared residuals that rise so many times less on one side than their quadratic: so much larger is the variance,
     up to that of the spread. A determined axis costs no simulation."""
     chosen, curvature = settings({"hencky": ELASTIC}, spread=2.0, determined=0.1), np.diag([1e4, 5.0])
-    run = FamilyRun(Family("hencky", ELASTIC), [None], [0], chosen)
+    run = FamilyRun(Family("hencky", ELASTIC), [SimpleNamespace(deviations=9)], [0], chosen)
     run.fit, tried = Linearisation(np.pad(curvature, (0, 9))[None], np.zeros((1, 11)), 1.0, 1.0), []
     run._covariance = lambda: np.diag([1e-4, 0.25] + [0.0] * 9)
 
@@ -632,12 +632,14 @@ def fits(**scores: float) -> list[FamilyFit]:
 
 def test_near_scores_are_ties_unless_one_family_contains_the_chosen_one():
     options = settings({"hencky": ELASTIC}, tie=0.1)
-    best, ties = _select(fits(hencky=-8.0, von_mises=-7.95, neo_hookean=-7.95, drucker_prager=-7.8), options)
+    best, ties = select_family(
+        fits(hencky=-8.0, von_mises=-7.95, neo_hookean=-7.95, drucker_prager=-7.8), options
+    )
     assert best.family.name == "hencky" and ties == ["neo_hookean"]
-    best, ties = _select(fits(hencky=-7.95, von_mises=-8.0), options)
+    best, ties = select_family(fits(hencky=-7.95, von_mises=-8.0), options)
     assert best.family.name == "von_mises" and ties == ["hencky"]
     with pytest.raises(NonFiniteError, match="every candidate"):
-        _select(fits(hencky=math.inf), options)
+        select_family(fits(hencky=math.inf), options)
 
 
 def test_nesting_of_families():

@@ -9,14 +9,15 @@ import torch
 from neuma_lib.config.velocity import VelocityConfig
 from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.coupling.particle_gs import ParticleGS
-from neuma_lib.fitting.velocity import UNKNOWNS, _Flight, estimate_velocity
+from neuma_lib.fitting.velocity import UNKNOWNS, _Flight, estimate_velocities, estimate_velocity
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.sim.clamps import Clamp
 from neuma_lib.sim.model import contact_clearance
 from neuma_lib.sim.rollout import rollout
+from neuma_lib.sim.state import State
 from neuma_lib.splatting.observation import Observation
 from tests.support.errors import refused
-from tests.support.grounding_scene import MODEL, PRIOR, RADIUS, TRUTH, ball, observe
+from tests.support.grounding_scene import MODEL, PRIOR, RADIUS, TRUTH, ball, camera, observe
 
 FRAMES = (0, 4, 8, 12, 16, 20, 60)
 
@@ -199,3 +200,37 @@ def test_a_body_that_starts_in_contact_is_an_input_error():
     observation = observe(body, [0.0, 0.0, 0.0], FRAMES)
     with refused("frames"):
         estimate(body, observation)
+
+
+def test_several_bodies_fly_until_they_touch():
+    """A ball that catches up with a slower one, next to which it hides a part of it. Frames of the contact would change
+    the slower one's velocity."""
+    bodies = [ball(height=0.75), ball(height=0.35, seed=1)]
+    velocities, frames = [(0.3, -2.5, 0.0), (0.0, 0.5, 0.2)], tuple(range(0, 61, 6))
+    law, cameras = analytic_law(PRIOR, MODEL.dt), camera()
+    states = [body.state(v) for body, v in zip(bodies, velocities, strict=True)]
+    run = dict(steps=frames[-1], frames=frames)
+    path = rollout(MODEL, law, State.joined(states, separate=True), **run)
+    x, F = (value.split([len(body.x0) for body in bodies], dim=1) for value in (path.x, path.F))
+    renders = [body.particle_gs(cameras) for body in bodies]
+    cover = [own.coverage(*state)[..., 0] for own, *state in zip(renders, x, F, strict=True)]
+    videos = []
+    for k in (0, 1):
+        hidden = (cover[1 - k] > 0.05) & ((k == 1) | (cover[1 - k] > cover[k]))
+        images = renders[k](x[k], F[k]).masked_fill(hidden[..., None], 1.0)
+        videos.append([Observation(frames, images, cameras, hidden=hidden)])
+    assert (videos[1][0].hidden & (cover[1] > 0.05)).any()
+    motions = estimate_velocities(MODEL, law, bodies, videos, VelocityConfig(ridge=0.0))
+    flights = [_Flight(MODEL, law, body, frames) for body in bodies]
+    for motion, v in zip(motions, velocities, strict=True):
+        assert np.abs(motion.v0 - v).max() < 0.02, motion.v0
+        assert 3 <= len(motion.frames) < len(frames) - 2
+    gaps = [
+        float(torch.cdist(*(flight(*(torch.tensor(v).double() for v in (v0, (0.0, 0.0, 0.0))), (n,))[0][0]
+              for flight, v0 in zip(flights, velocities, strict=True))).min())
+        for n in motions[0].frames
+    ]  # fmt: skip
+    assert min(gaps) > 0
+    alone = estimate(bodies[1], videos[1][0])
+    errors = [abs(each.v0[1] - velocities[1][1]) for each in (alone, motions[1])]
+    assert errors[0] > 3 * errors[1] and len(alone.frames) > len(motions[1].frames)

@@ -14,7 +14,13 @@ from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.io.files import atomic, read_json, write_json
 from neuma_lib.io.gaussians import load_gaussians, save_gaussians
 from neuma_lib.io.hdf5 import read_arrays, write_arrays
-from neuma_lib.io.images import load_observation, read_image_set, write_transforms
+from neuma_lib.io.images import (
+    list_body,
+    load_observation,
+    read_hidden,
+    read_image_set,
+    write_transforms,
+)
 from neuma_lib.io.mesh import read_mesh, write_mesh
 from neuma_lib.io.particles import with_motion
 from neuma_lib.io.ply import read_ply, write_ply
@@ -164,6 +170,36 @@ def edit(path, change):
     data = json.loads(path.read_text())
     change(data)
     path.write_text(json.dumps(data))
+
+
+def test_images_of_one_of_several_bodies(image_set, tmp_path):
+    """Empty where another body is seen; frames without the body are not listed."""
+    labels = np.zeros((12, 16), dtype=np.uint8)
+    labels[2:9, 3:8], labels[2:9, 8:12] = 1, 2
+
+    def with_labels(data):
+        for frame in data["frames"]:
+            frame["label_path"] = f"label_{frame['file_path']}"
+            visible = np.where(labels == 2, 0, labels) if frame["step"] == 5 else labels
+            Image.fromarray(visible).save(image_set.parent / frame["label_path"])
+
+    edit(image_set, with_labels)
+    first, second = tmp_path / "first" / "transforms.json", tmp_path / "second" / "transforms.json"
+    assert list_body(image_set, first, 1) == (6, 6) and list_body(image_set, second, 2) == (4, 6)
+    images = read_image_set(second)
+    assert images.steps.tolist() == [0, 0, 2, 2]
+    np.testing.assert_array_equal(images.images[0, ..., 3], 255 * (labels == 2))
+    np.testing.assert_array_equal(images.images[..., :3], read_image_set(image_set).images[2:, ..., :3])
+    np.testing.assert_array_equal(read_hidden(second)[0], labels == 1)
+    assert read_hidden(image_set) is None
+    video = load_observation(second, [0, 1])
+    assert video.hidden.shape == (2, 2, 12, 16) and torch.equal(
+        video.hidden[0, 0], torch.from_numpy(labels == 1)
+    )
+    assert torch.equal(video.select([1]).hidden, video.hidden[1:])
+    assert (video.colours()[video.hidden] == 1).all()
+    with refused("transforms.json", problem="body 3"):
+        list_body(image_set, tmp_path / "third" / "transforms.json", 3)
 
 
 def test_image_set(image_set):

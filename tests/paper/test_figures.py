@@ -173,6 +173,13 @@ DATA = {
         row_titles=["JellyStair", "ClayPress", "SandGlass"],
         column_titles=[""] * 4,
     ),
+    "pile": lambda: pictures(
+        4,
+        5,
+        {},
+        row_titles=["filmed", "understood", "one taken out", "true laws"],
+        column_titles=[f"{100 * i} ms" for i in range(5)],
+    ),
     "stills": lambda: pictures(
         3,
         3,

@@ -5,8 +5,8 @@ import yaml
 
 from neuma_lib.io.simulator import simulator
 from neuma_lib.project import checks
+from neuma_lib.project.cases import case
 from neuma_lib.project.loading import merged
-from neuma_lib.project.paths import result_path
 from neuma_lib.sim.bodies import Pair
 from tests.conftest import ROOT
 from tests.support.errors import refused
@@ -17,7 +17,11 @@ PILE = yaml.safe_load((ROOT / "config" / "pile.yaml").read_text())["scenes"]["Pi
 @pytest.fixture
 def with_pile(changed):
     """Settings with the shipped pile and changes of it."""
-    return lambda changes=None, **others: changed(scenes={"Pile": merged(PILE, changes or {})}, **others)
+
+    def settings(changes=None, scenes=None, **others):
+        return changed(scenes={"Pile": merged(PILE, changes or {}), **(scenes or {})}, **others)
+
+    return settings
 
 
 def test_bodies_and_pairs_reach_the_simulator(with_pile):
@@ -54,10 +58,38 @@ def test_pairs_need_bodies(changed):
         changed(scenes={"Alone": {"like": "ClayCat", "pairs": [{"bodies": ["a", "b"]}]}})
 
 
-def test_a_pile_is_not_reconstructed(with_pile, changed):
-    """Nor does an experiment or a scene of several videos take its material."""
-    with refused("scenes.Pile.bodies", remedy="data/Pile"):
-        result_path(with_pile(), "Pile", "gaussians.ply")
+def test_each_body_has_a_scene(with_pile):
+    settings = with_pile(advanced={"scenes.Pile.friction": 0.4})
+    assert settings.body_scenes("Pile+seed=1") == [f"Pile_{name}+seed=1" for name in PILE["bodies"]]
+    duck = settings.scenes["Pile_duck"]
+    assert duck.has_truth and duck.part_of == ("Pile", "duck") and duck.friction == 0.4
+    assert duck.law == settings.scenes["Pile"].bodies["duck"].law and duck.steps == PILE["steps"]
+    assert settings.obstacles("Pile_duck") == {"boundary": 0.4, "contact": "particles"}
+    assert "Pile_duck" not in settings.plain_scenes
+    with refused("scenes.Pile.bodies.duck"):
+        with_pile(scenes={"Pile_duck": {"like": "ClayCat"}})
+
+
+def test_bodies_of_a_pile_touch_each_other_in_experiments(with_pile):
+    names = ["ball", "fish"]
+    bodies = [{"scene": f"Pile_{name}"} for name in names]
+    settings = with_pile(
+        experiments={
+            "without_duck": {"title": "X", "bodies": bodies, "steps": 9},
+            "with_cat": {"title": "X", "bodies": [*bodies, {"scene": "ClayCat"}], "steps": 9},
+        }
+    )
+    assert settings.touching_bodies("without_duck") == ("Pile", names)
+    assert settings.obstacles("without_duck")["pairs"] == [{"first": 0, "second": 1, "friction": 0.5}]
+    assert settings.touching_bodies("with_cat") == (None, []) and "pairs" not in settings.obstacles(
+        "with_cat"
+    )
+
+
+def test_a_pile_has_no_material_of_its_own(with_pile, changed):
+    """No method, experiment or scene of several videos takes it."""
+    with refused("Pile/neuma", remedy="Pile_fish, Pile_duck, Pile_ball"):
+        case(with_pile(), "Pile", "neuma")
     body = {"scene": "Pile", "shape": "ball", "height": 0.5}
     with refused("experiments.x.bodies.0.scene"):
         with_pile(experiments={"x": {"title": "X", "bodies": [body], "steps": 9}})

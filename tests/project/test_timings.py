@@ -7,10 +7,11 @@ from pathlib import Path
 import pytest
 
 from neuma_lib.errors import InputError
-from neuma_lib.project.timings import core_seconds, timings_table
+from neuma_lib.project.timings import timings_table, used
 
 ROOT = Path(__file__).resolve().parents[2]
 LOG = "[2026-11-22 10:00:00,000] core seconds: {} to start, {} of work\n"
+WITH_MEMORY = LOG.replace("work", "work; memory: 800.5 MB")
 
 
 def record(results, job, seconds, memory, log=""):
@@ -24,7 +25,7 @@ def record(results, job, seconds, memory, log=""):
 
 
 def test_runs_of_a_stage_are_summed_and_the_most_expensive_stage_is_first(tmp_path):
-    record(tmp_path, "A/mesh", 10.5, 300, LOG.format(1, 2))
+    record(tmp_path, "A/mesh", 10.5, 300, WITH_MEMORY.format(1, 2))
     record(tmp_path, "A/neuma/material", 100, "NA", LOG.format(9, 9) + LOG.format(2, 80))
     record(tmp_path, "B+seed=1/neuma/material", 50, 700.25, LOG.format(2.5, 40))
     record(tmp_path, "chamfer_table", 0.25, "-", "ended before its core seconds were logged")
@@ -32,9 +33,9 @@ def test_runs_of_a_stage_are_summed_and_the_most_expensive_stage_is_first(tmp_pa
         "| stage | runs | all together [s] | longest [s] | core seconds | of these to start | most memory [MB] |",
         "|---|---:|---:|---:|---:|---:|---:|",
         "| material | 2 | 150 | 100 | 124.5 | 4.5 | 700.2 |",
-        "| mesh | 1 | 10.5 | 10.5 | 3 | 1 | 300 |",
+        "| mesh | 1 | 10.5 | 10.5 | 3 | 1 | 800.5 |",
         "| chamfer_table | 1 | 0.25 | 0.25 | 0 | 0 | 0 |",
-        "| total | 4 | 160.8 | 100 | 127.5 | 5.5 | 700.2 |",
+        "| total | 4 | 160.8 | 100 | 127.5 | 5.5 | 800.5 |",
     ]
 
 
@@ -70,6 +71,7 @@ run_script(main, snakemake)
 """
     done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0 and "core seconds" not in done.stderr
-    start, work = core_seconds(log)
+    start, work, memory = used(log)
+    assert 10 < memory < 4000
     assert start >= 1.0 and 0.5 <= work < 1.0
-    assert core_seconds(tmp_path / "none.log") is None
+    assert used(tmp_path / "none.log") is None

@@ -11,6 +11,7 @@ from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.sim.batch import rollout_batch
 from neuma_lib.sim.bodies import Pair
 from neuma_lib.sim.model import MPM, consecutive
+from neuma_lib.sim.prediction import predict
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 from tests.support.contact_scenes import lattice
@@ -269,17 +270,23 @@ def _at_rest(block):
     return x, torch.zeros(3).double(), mass, vol0
 
 
-def test_copies_equal_single_rollouts():
-    """With their own starts and frictions of pairs."""
+@pytest.mark.parametrize("together", [1, 2])
+def test_copies_equal_single_rollouts(together):
+    """With their own starts and frictions of pairs, one law or a law of each body."""
     start, _ = pile()
-    law, models = make_law("hencky"), [MPM(14, DT, pairs=(Pair(0, 1, mu),)) for mu in (0.1, 0.7)]
+    models = [MPM(14, DT, pairs=(Pair(0, 1, mu),)) for mu in (0.1, 0.7)]
+    laws = [[make_law(name) for name in LAWS[:2]], make_law("hencky")]
     starts = [start, replace(start, v=0.9 * start.v)]
     run = dict(steps=40, frames=FRAMES)
-    together = rollout_batch(models, [law, law], starts, together=2, **run)
-    for model, own, path in zip(models, starts, together, strict=True):
+    paths = rollout_batch(models, laws, starts, together=together, **run)
+    for model, law, own, path in zip(
+        models, [consecutive(laws[0], SIZES[:2]), laws[1]], starts, paths, strict=True
+    ):
         alone = rollout(model, law, own, **run)
         torch.testing.assert_close(path.x, alone.x, rtol=0, atol=1e-12)
-    assert (together[0].x - together[1].x).abs().max() > 1e-3
+    assert (paths[0].x - paths[1].x).abs().max() > 1e-3
+    with refused("laws"):
+        rollout_batch(models, [laws[0], [make_law("hencky")] * 3], starts, **run)
 
 
 def test_tracers_follow_their_body():
@@ -292,6 +299,17 @@ def test_tracers_follow_their_body():
     torch.testing.assert_close(path.tracers, path.x[:, picked], rtol=0, atol=1e-12)
     with refused("tracer_bodies"):
         rollout(model, regions, start, tracers=start.x[picked], tracer_bodies=(10, 9), **run)
+
+
+def test_predicted_tracers_belong_to_the_nearest_body():
+    """In any order."""
+    start, regions = pile()
+    picked = torch.cat([torch.arange(0, 60, 6), torch.arange(60, 110, 5)])
+    picked = picked[torch.randperm(len(picked), generator=torch.Generator().manual_seed(0))]
+    model = MPM(14, DT, pairs=(Pair(0, 1, 0.3),))
+    path, failure = predict(model, regions, start, (30, 60), start.x[picked])
+    assert failure is None
+    torch.testing.assert_close(path.tracers, path.x[:, picked], rtol=0, atol=1e-12)
 
 
 def test_float32_agrees_with_float64():

@@ -235,3 +235,22 @@ def test_the_extrapolated_sag_is_that_of_scikit_fem():
     assert own == pytest.approx(other, rel=0.01) and abs(theirs[0] / other - 1) > 0.08
     assert own == pytest.approx(drops[1], rel=0.01)
     assert abs(in_scikit_fem(corners(bodies[1]).to_meshtet(), skfem.ElementTetP1(), 1)) < 0.3 * abs(own)
+
+
+def test_interpolation_is_exact_for_quadratic_fields():
+    """Values and gradients at points of two blocks of different size. Points outside are refused."""
+    planes = [np.array([0.0, 0.3, 1.0]), np.array([0.0, 0.5]), np.array([-0.2, 0.1, 0.4])]
+    body = Hexahedra.of_blocks(planes, np.array([[[True, True]], [[True, False]]]))
+    points = np.array([[0.1, 0.2, 0.3], [0.3, 0.5, -0.2], [0.9, 0.1, 0.05]])
+
+    def field(x):
+        return x[:, 0] ** 2 - 2 * x[:, 0] * x[:, 1] + 3 * x[:, 2] ** 2 + x[:, 1]
+
+    weights, slopes = body.at(points)
+    np.testing.assert_allclose(weights @ field(body.nodes), field(points), atol=1e-12)
+    x, y, z = points.T
+    expected = np.stack([2 * x - 2 * y, 1 - 2 * x, 6 * z], axis=1)
+    got = np.stack([slope @ field(body.nodes) for slope in slopes], axis=1)
+    np.testing.assert_allclose(got, expected, atol=1e-12)
+    with refused("points", problem="(0.9, 0.1, 0.3) m is outside"):
+        body.at(np.array([[0.1, 0.1, 0.1], [0.9, 0.1, 0.3]]))

@@ -6,7 +6,7 @@ import trimesh
 
 from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.gaussians import Gaussians
-from neuma_lib.splatting.labels import bodies_of
+from neuma_lib.splatting.labels import bodies_of, without_others
 from neuma_lib.splatting.rasterizer import rasterize
 from neuma_lib.splatting.spherical_harmonics import SH_C0
 from neuma_lib.splatting.viewpoints import static_views
@@ -80,3 +80,21 @@ def test_labels_that_do_not_match_are_refused():
         bodies_of(gaussians, cameras, labels, 1)
     with refused("labels", problem="body 2"):
         bodies_of(gaussians, cameras, labels.clamp(max=1), 2)
+
+
+def test_a_hidden_part_is_that_of_the_whole_body():
+    """Images of a ball behind others, completed, are those of the ball alone; visible pixels are not changed."""
+    gaussians, bodies = touching()
+    cameras, labels = labelled(gaussians, bodies, 4)
+    own = gaussians[bodies == 1]
+    pictures, alphas = rasterize(
+        own.means[None], own.covars()[None], own.opacities, own.sh(), cameras.viewmats, cameras.Ks, 96, 96,
+        background=(0.0, 0.0, 0.0), eps2d=0.0,
+    )  # fmt: skip
+    alone = torch.cat([pictures[0] / alphas[0, ..., None].clamp_min(1e-6), alphas[0, ..., None]], dim=-1)
+    hidden = (labels != 0) & (labels != 2)
+    images = torch.where(hidden[..., None], 0.0, alone)
+    assert (alone[..., 3][hidden] > 0.5).sum() > 100
+    completed = without_others(own, cameras, images, hidden)
+    torch.testing.assert_close(completed, alone.clamp(0, 1))
+    assert (without_others(own, cameras, images, torch.zeros_like(hidden)) == images).all()

@@ -355,3 +355,30 @@ def test_a_body_is_blurred_over_the_exposure(room):
     (place, spread), (blurred_place, blurred_spread) = moments
     assert abs(blurred_place - place) < 0.5
     assert np.sqrt(12 * (blurred_spread - spread)) == pytest.approx(np.ptp(ends[:, 1]), rel=0.15)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("bpy") is None, reason="needs Blender (bpy)")
+def test_a_rolling_shutter_shears_what_moves_across_the_picture(room):
+    """Lower rows are read later, so that a post which moves to the right leans by its way in a row time."""
+    eye = next(iter(stage.video_cameras(DEMO).values()))
+    eye = stage.Eye(eye.c2w, eye.lens.resized(3))
+    mesh = trimesh.creation.box((0.06, 0.4, 0.06))
+    rest = (mesh.vertices + stage.MIDDLE + [0, 0.26, 0])[None]
+    speed, row_time = 15.0, 2e-5
+    right = eye.c2w[:3, 0]
+    body = Moving(
+        rest, np.broadcast_to(speed * right, rest.shape), mesh.faces, np.tile([1.0, 0.0, 0.0], (8, 1))
+    )
+    ends = eye.project(stage.MIDDLE + np.array([[0, 0.2, 0], [0, 0.44, 0]]))  # above the floor in the picture
+    rows = slice(int(ends[:, 1].min()), int(ends[:, 1].max()))
+    region = (0, rows.start, eye.lens.width, rows.stop)
+    shots = [Shot(eye.c2w, stage.lens_row(eye.lens), frame, region) for frame in (-1, 0)]
+    leans = []
+    for time in (0.0, row_time):
+        empty, full = shoot(room, body, shots, samples=8, exposure=2e-4, row_time=time)
+        red = ((full - empty)[..., 0] - (full - empty)[..., 1]).clip(0)
+        middles = red @ (np.arange(eye.lens.width) + 0.5) / red.sum(axis=1)
+        leans.append(np.polyfit(np.arange(len(middles)), middles, 1)[0])
+    distance = np.linalg.norm(stage.MIDDLE + [0, 0.32, 0] - eye.c2w[:3, 3])
+    expected = speed * row_time * eye.lens.focal / distance
+    assert leans[1] - leans[0] == pytest.approx(expected, rel=0.1)

@@ -8,6 +8,7 @@ from neuma_lib.project.loading import read_yaml
 from studies.capture_benchmark.filming import hand_path, shaken, together
 from studies.capture_benchmark.furniture import FREE, RULER, furniture, marks, rolling_ball
 from studies.capture_benchmark.planned import capture_settings, photograph_files
+from studies.capture_benchmark.rooms import refusal, table
 from studies.capture_benchmark.settings import DemoCapturesConfig
 from studies.capture_benchmark.stage import MIDDLE, lying, photographers, solid
 
@@ -92,3 +93,31 @@ def test_a_hand_drifts_smoothly():
     assert (path[0] == 0).all() and 2 < path.std() < 8
     assert np.abs(np.diff(path, axis=0)).max() < 4
     assert (hand_path(60, 0.0, np.random.default_rng(2)) == 0).all()
+
+
+def test_a_table_has_a_row_for_each_capture_that_ran(demo):
+    quantity = {"quantity": "E", "determined": True, "error_percent": -12.3, "error_in_std": -2.5}
+    vague = {**quantity, "quantity": "nu", "determined": False}
+    ran = {
+        "duck_neo_hookean": {
+            "end": "report",
+            "scale_percent": 0.123,
+            "up_deg": 0.5,
+            "iou_photographs": 0.961,
+            "gravity_flight": [1.02, 0.4],
+            "gravity_placed": [0.99, 0.2],
+            "family": "hencky (wrong)",
+            "quantities": [quantity, vague],
+            "core_seconds": 512.3,
+        },
+        "duck_handheld": {"end": "the camera moves during the video"},
+    }
+    lines = table(demo, ran).splitlines()
+    assert len(lines) == 4 and "| E -12 % | 0 of 1 | 512 |" in lines[2] and "0.990, 0.2°" in lines[2]
+    assert "the camera moves" in lines[3]
+
+
+def test_a_refusal_is_the_message_of_the_stage_that_stopped():
+    output = "[04:00] something\nERROR: mug, one, left: the camera moves (more in rooms/results/logs/a.log)\nmore\n"
+    assert refusal(output) == "mug, one, left: the camera moves"
+    assert refusal("a traceback").endswith("traceback")

@@ -1,6 +1,7 @@
 """The experiment of docs/results/silicone.md with a known beam: same size, camera and clamp."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import trimesh
@@ -8,7 +9,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from neuma_lib.data.blender.scene import Surface, render_images
-from neuma_lib.fitting.resting import RestingBody, StillResiduals
+from neuma_lib.fitting.resting import UNKNOWNS, RestingBody, StillResiduals
 from neuma_lib.geometry.blocks import hexahedra
 from neuma_lib.geometry.obstacles import Obstacle
 from neuma_lib.geometry.outline import silhouette
@@ -38,14 +39,21 @@ def dumbbell():
     return trimesh.Trimesh(np.concatenate([bottom, top]), np.concatenate(faces), process=False)
 
 
-def resting_beam(size, clamp=CLAMP, nu=0.49):
+HELD = np.array([[-0.11, -0.04, -0.1], [-0.084, -0.014, 0.1]])
+"""Lower edge of the free end, where a line holds the beam before a release."""
+
+
+def law_spec(nu=0.49):
+    """Its law, with mu = 100 Pa."""
+    return {"elasticity": {"name": "neo_hookean", "E": 200.0 * (1 + nu), "nu": nu}}
+
+
+def resting_beam(size, clamp=CLAMP, nu=0.49, held=None):
     """The beam with elements of a size [m], clamped from x = clamp on."""
-    held = Clamp((clamp, -1.0, -1.0), (1.0, 1.0, 1.0))
-    law = Law.from_spec({"elasticity": {"name": "neo_hookean", "E": 200.0 * (1 + nu), "nu": nu}})
+    clamped = Clamp((clamp, -1.0, -1.0), (1.0, 1.0, 1.0))
+    mesh, law = hexahedra(dumbbell(), size, [clamped.lowest]), Law.from_spec(law_spec(nu))
     hidden = np.array([[HIDDEN, -1, -1], [1, 1, 1]])
-    return RestingBody(
-        hexahedra(dumbbell(), size, [held.lowest]), law, 100.0, [held], np.eye(3), hidden, 0.005
-    )
+    return RestingBody(mesh, law, 100.0, [clamped], np.eye(3), hidden, 0.005, held)
 
 
 def observe(mask, seed=1):
@@ -56,12 +64,29 @@ def observe(mask, seed=1):
     return Still(mask, K, MARKER, pixels[:, :2] / pixels[:, 2:] + noise)
 
 
-def image_of(beam, ratio):
-    """Mask (HEIGHT, WIDTH) of the beam at rest with mu / rho, filled triangle by triangle."""
-    empty = np.zeros((HEIGHT, WIDTH), dtype=bool)
-    empty[:2, :2] = True  # any contour
-    residuals = StillResiduals(observe(empty), beam, POSE, PLACEMENT, 0.004, ratio)
-    return silhouette(residuals.surface(np.zeros(10))[1], beam.triangles, HEIGHT, WIDTH)
+def image_of(beam, *shape, still=None, centre=None):
+    """Mask (HEIGHT, WIDTH) of the beam with mu / rho, and what else its shape depends on, filled triangle by triangle.
+
+    Args:
+        still: whose camera is used, by default that of `observe`.
+        centre: change of the principal point [px].
+    """
+    drawn = observe(np.pad(np.ones((2, 2), dtype=bool), ((0, HEIGHT - 2), (0, WIDTH - 2))))  # any contour
+    if still is not None:
+        drawn = replace(drawn, K=still.K, camera=still.camera)
+    residuals = StillResiduals(drawn, beam, POSE, PLACEMENT, 0.004, *shape, centre=centre)
+    return silhouette(residuals.surface(np.zeros(UNKNOWNS))[1], beam.triangles, HEIGHT, WIDTH)
+
+
+def depth_camera(mask):
+    """A still of a second camera without a marker. A strip across the beam and the box at its root are unknown."""
+    K2, camera = K.copy(), np.eye(4)
+    K2[0, 0] = K2[1, 1] = 740.0
+    camera[:3, :3] = Rotation.from_euler("xy", [1.5, -1.0], degrees=True).as_matrix()
+    camera[:3, 3] = 0.001, -0.014, 0.002
+    unknown = np.zeros((HEIGHT, WIDTH), dtype=bool)
+    unknown[:, 520:570] = unknown[:, 720:] = True
+    return Still(mask & ~unknown, K2, np.empty((0, 3)), np.empty((0, 2)), camera, unknown)
 
 
 def filmed(beam, ratio, folder):
@@ -76,6 +101,22 @@ def filmed(beam, ratio, folder):
     render_images(surface, views, [(0, 0)], folder, ["beam.png"], samples=8, obstacles=[hides])
     with Image.open(folder / "beam.png") as image:
         return np.asarray(image)[..., 3] > 127
+
+
+def write_swing(root, frames, folder="swing"):
+    """A folder of label maps of silhouettes (time [s] -> still), and the second camera."""
+    (root / folder).mkdir()
+    for k, still in enumerate(frames.values()):
+        labels = np.where(still.unknown, 128, np.where(still.mask, 255, 0))
+        Image.fromarray(np.uint8(labels)).save(root / folder / f"label_{k:02d}.png")
+    times = {"figures": {str(k): time for k, time in enumerate(frames)}}
+    (root / folder / "times.json").write_text(json.dumps(times))
+    still, values = next(iter(frames.values())), json.loads((root / "calibration.json").read_text())
+    values["depth"] = {"fx": still.K[0, 0], "fy": still.K[1, 1]}
+    values["depth"] |= {"cx": still.K[0, 2] - 0.5, "cy": still.K[1, 2] - 0.5}
+    values["colour_to_depth_rotation"] = still.camera[:3, :3].tolist()
+    values["colour_to_depth_translation_m"] = still.camera[:3, 3].tolist()
+    (root / "calibration.json").write_text(json.dumps(values))
 
 
 def write_record(root, masks, record="twin"):

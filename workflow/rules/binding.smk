@@ -10,7 +10,7 @@ rule binding:
         binding=f"{RESULTS}/{{scene}}/binding.h5",
         particles=f"{RESULTS}/{{scene}}/particles.h5",
     wildcard_constraints:
-        scene=f"{PICTURED_SCENE}|{SPLAT_SCENE}",
+        scene=f"{PICTURED_SCENE}|{PART_SCENE}|{SPLAT_SCENE}",
     params:
         binding=SETTINGS.binding.plain(),
         # a splat may be bound to the sampled particles alone

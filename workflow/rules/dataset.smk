@@ -75,6 +75,20 @@ rule ground_truth:
         "../scripts/ground_truth.py"
 
 
+rule body_truth:
+    input:
+        truth=of_pile(of_data("truth.h5")),
+    output:
+        truth=f"{DATA}/{{scene}}/truth.h5",
+    wildcard_constraints:
+        scene=scenes_with("truth", "part"),
+    params:
+        bodies=of_pile(of_section(lambda scene: list(scene.bodies))),
+        body=of_section(lambda scene: scene.part_of[1]),
+    script:
+        "../scripts/body_truth.py"
+
+
 for part, part_images in (("static", SETTINGS.dataset.static), ("dynamic", SETTINGS.dataset.dynamic)):
 
     rule:
@@ -99,6 +113,21 @@ for part, part_images in (("static", SETTINGS.dataset.static), ("dynamic", SETTI
             device=RENDER_DEVICE,
         script:
             "../scripts/render.py"
+
+    rule:
+        name:
+            f"body_{part}"
+        input:
+            transforms=of_pile(of_data(f"{part}/transforms.json")),
+        output:
+            transforms=f"{DATA}/{{scene}}/{part}/transforms.json",
+        wildcard_constraints:
+            scene=scenes_with(part, "part"),
+        params:
+            bodies=of_pile(of_section(lambda scene: list(scene.bodies))),
+            body=of_section(lambda scene: scene.part_of[1]),
+        script:
+            "../scripts/body_images.py"
 
     rule:
         name:

@@ -13,7 +13,7 @@ rule initial_state:
     output:
         report=f"{RESULTS}/{{scene}}/initial_state.json",
     wildcard_constraints:
-        scene=TRUE_SCENE,
+        scene=LONE_SCENE,
     params:
         scene=scene_setting("shape", "size", "height", "center", "rotation", "velocity", "spin", "density"),
         particles=SETTINGS.geometry.particles,
@@ -29,9 +29,14 @@ rule tracers:
     output:
         tracers=f"{RESULTS}/{{scene}}/tracers.h5",
     wildcard_constraints:
-        scene=f"{TRUE_SCENE}|{EXPERIMENT}",
+        scene=f"{TRUE_SCENE}|{PILE_SCENE}|{EXPERIMENT}",
     params:
-        tracers=SETTINGS.evaluation.tracers,
+        # one of several bodies has its share of the tracers of all
+        tracers=lambda wildcards: (
+            None
+            if not of_experiment(wildcards) and SETTINGS.scene(wildcards.scene).part_of
+            else SETTINGS.evaluation.tracers
+        ),
         seed=SETTINGS.seed,
     script:
         "../scripts/tracers.py"
@@ -50,7 +55,7 @@ rule evaluate:
         rollout=f"{RESULTS}/{{scene}}/{{method}}/rollout.h5",
         metrics=f"{RESULTS}/{{scene}}/{{method}}/metrics.json",
     wildcard_constraints:
-        scene=f"{TRUE_SCENE}|{EXPERIMENT}",
+        scene=f"{TRUE_SCENE}|{PILE_SCENE}|{EXPERIMENT}",
     resources:
         gpu=GPU,
     params:

@@ -1,4 +1,5 @@
-"""Laws learned in scenes, put to use elsewhere: on another shape, several on one grid, or for longer."""
+"""Laws learned in scenes, put to use elsewhere: on another shape, several on one grid, or for longer. And the bodies
+of a scene of several, put together."""
 
 
 rule experiment_start:
@@ -17,11 +18,12 @@ rule experiment_start:
         mesh=f"{RESULTS}/{{scene}}/mesh.ply",
         velocity=f"{RESULTS}/{{scene}}/velocity.json",
     wildcard_constraints:
-        scene=EXPERIMENT,
+        scene=f"{EXPERIMENT}|{PILE_SCENE}",
     params:
         bodies=body_settings(
             "scene", "reconstructed", "shape", "size", "height", "center", "velocity", "spin", "appearance"
         ),
+        separate=has_separate_bodies,
         particles=SETTINGS.geometry.particles,
         sampling=SETTINGS.geometry.sampling,
         seed=seed_of("particles"),

@@ -432,5 +432,33 @@ FIGURES = {
     },
 }
 
+if DRAWN.pile:
+    PILE, _ = SETTINGS.touching_bodies(DRAWN.pile)
+    TAKEN_OUT = f"experiments/{DRAWN.pile}"
+    FIGURES["pile"] = {
+        "kind": "h5",
+        "input": {
+            "kernels": kernels("laws", "rendering"),
+            "transforms": f"{DATA}/{PILE}/dynamic/transforms.json",
+            **each_of([PILE, DRAWN.pile]),
+            "rollouts": [
+                f"{RESULTS}/{run}/rollout.h5"
+                for run in (f"{PILE}/constants", f"{TAKEN_OUT}/constants", f"{TAKEN_OUT}/true_law")
+            ],
+        },
+        "params": {
+            "body_of": [0, 1, 1],
+            "titles": ["filmed", "understood", "one taken out", "true laws"],
+            "frames": [
+                list(SETTINGS.frame_steps(PILE)),
+                list(SETTINGS.dataset.frame_steps(SETTINGS.experiment(DRAWN.pile).steps)),
+            ],
+            "dt": SETTINGS.scene(PILE).dt,
+            **IN_VIEW,
+            "shown": DRAWN.shown,
+        },
+        "default_target": False,
+    }
+
 # Read by report/figure.rst. They are no parameters, as an edit of a caption need not draw the figure again.
 config["captions"] = {figure: caption(made_of.get("module", figure)) for figure, made_of in FIGURES.items()}

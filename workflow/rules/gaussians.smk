@@ -21,17 +21,25 @@ rule gaussians:
         "../scripts/gaussians.py"
 
 
+use rule gaussians as gaussians_of_bodies with:
+    output:
+        gaussians=f"{RESULTS}/{{scene}}/whole.ply",
+        report=f"{RESULTS}/{{scene}}/whole.json",
+    wildcard_constraints:
+        scene=PILE_SCENE,
+
+
 rule body_gaussians:
     input:
         kernels=kernels("rendering"),
-        gaussians=f"{RESULTS}/{{scene}}/gaussians.ply",
-        transforms=of_data("static/transforms.json"),
+        gaussians=of_pile(of_replicate("whole.ply")),
+        transforms=of_pile(of_data("static/transforms.json")),
     output:
-        gaussians=f"{RESULTS}/{{scene}}/bodies/{{body}}.ply",
+        gaussians=f"{RESULTS}/{{scene}}/gaussians.ply",
     wildcard_constraints:
-        scene=PILE_SCENE,
-        body="[^/]+",
+        scene=PART_SCENE,
     params:
-        bodies=of_section(lambda scene: list(scene.bodies)),
+        bodies=of_pile(of_section(lambda scene: list(scene.bodies))),
+        body=of_section(lambda scene: scene.part_of[1]),
     script:
         "../scripts/body_gaussians.py"

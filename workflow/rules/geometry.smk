@@ -8,7 +8,7 @@ rule mesh:
     output:
         mesh=f"{RESULTS}/{{scene}}/mesh.ply",
     wildcard_constraints:
-        scene=PICTURED_SCENE,
+        scene=f"{PICTURED_SCENE}|{PART_SCENE}",
     params:
         surface=SETTINGS.geometry.surface.plain(),
         photographs=SETTINGS.photographs.plain(),

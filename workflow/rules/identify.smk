@@ -15,6 +15,8 @@ for views in ("", "+views={views}"):
             obstacles=meshes_of_videos,
         output:
             identified=f"{RESULTS}/{{scene}}/identified{views}.json",
+        wildcard_constraints:
+            scene=SINGLE_SCENE,
         threads: identify_threads
         resources:
             gpu=GPU,
@@ -29,6 +31,32 @@ for views in ("", "+views={views}"):
             device=SETTINGS.device,
         script:
             "../scripts/identify.py"
+
+
+rule identify_bodies:
+    input:
+        **{name: of_each_body(of_replicate(file)) for name, file in BODY.items()},
+        kernels=kernels("laws", "rendering"),
+        transforms=of_data("dynamic/transforms.json"),
+        velocity=of_each_body(of_replicate("velocity.json")),
+        obstacles=obstacle_meshes,
+    output:
+        identified=f"{RESULTS}/{{scene}}/identified.json",
+    wildcard_constraints:
+        scene=PILE_SCENE,
+    threads: identify_threads
+    resources:
+        gpu=GPU,
+    params:
+        bodies=of_section(lambda scene: list(scene.bodies)),
+        simulation=simulation_settings,
+        densities=densities_of(SETTINGS.body_scenes),
+        identify=identify_settings,
+        given=of_section(lambda scene: {name: b.family for name, b in scene.bodies.items() if b.family}),
+        exposure=exposure,
+        device=SETTINGS.device,
+    script:
+        "../scripts/identify_bodies.py"
 
 
 rule identified_page:
@@ -64,3 +92,22 @@ use rule identified_table as identified_behind_table with:
         markdown=f"{RESULTS}/identified_{{table}}.md",
     params:
         scenes=lambda wildcards: identified_behind(wildcards.table),
+
+
+rule bodies_table:
+    input:
+        identified=of_replicate("identified.json"),
+        metrics=f"{RESULTS}/{{scene}}/constants/metrics.json",
+        true_law=f"{RESULTS}/{{scene}}/true_law/metrics.json",
+        alone=of_each_body(of_replicate("identified.json")),
+        alone_metrics=of_each_body(lambda wildcards: f"{RESULTS}/{wildcards.scene}/constants/metrics.json"),
+    output:
+        csv=f"{RESULTS}/{{scene}}/bodies.csv",
+        markdown=f"{RESULTS}/{{scene}}/bodies.md",
+    wildcard_constraints:
+        scene=PILE_SCENE,
+    params:
+        laws=of_section(lambda scene: {name: body.law.plain() for name, body in scene.bodies.items()}),
+        frictions=of_section(lambda scene: [pair.plain() for pair in scene.pairs]),
+    script:
+        "../scripts/bodies_table.py"

@@ -164,6 +164,10 @@ def evaluated_start(wildcards):
     """File of the initial motion: of the method on a scene, or of an experiment."""
     if of_experiment(wildcards):
         return result_path(subject(wildcards), "velocity.json")
+    if SETTINGS.scene(wildcards.scene).bodies:
+        body, *_ = cases.body_cases(SETTINGS, wildcards.scene, wildcards.method)
+        fitted = body.options.start == "identified"
+        return result_path(wildcards.scene, "identified.json" if fitted else "velocity.json")
     case = case_on(wildcards.scene, wildcards.method)
     return case.method.start_file(case)
 

@@ -1,6 +1,6 @@
 """Functions of the rules for bodies at rest in photographs, settings `stills`."""
 
-from neuma_lib.io.datasets.stills import still_files
+from neuma_lib.io.datasets.stills import still_files, swing_files
 
 RESTING = SETTINGS.stills
 RESTING_TITLES = [name.replace("_", " ") for name in RESTING.bodies]
@@ -19,6 +19,19 @@ def resting_inputs(body):
         "frames": [f"{RESTING.root}/{name}.json" for name in ("frames", "calibration")],
         "mesh": f"{RESTING.root}/{settings.mesh}",
         **({"source": f"{RESULTS}/stills/{source}.json"} if source else {}),
+    }
+
+
+def swing_inputs(name):
+    """The still of the held body, label maps, the mesh, and the fit of the hanging body."""
+    swing = RESTING.swings[name]
+    return {
+        "held": still_files(RESTING.root, swing.still, "mask")[0],
+        "silhouettes": list(swing_files(RESTING.root, swing.silhouettes).values()),
+        "times": f"{RESTING.root}/{swing.silhouettes}/times.json",
+        "frames": [f"{RESTING.root}/{name}.json" for name in ("frames", "calibration")],
+        "mesh": f"{RESTING.root}/{RESTING.bodies[swing.body].mesh}",
+        "source": f"{RESULTS}/stills/{swing.body}.json",
     }
 
 

@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 
 from neuma_lib.config.obstacles import is_mesh_file
+from neuma_lib.config.variants import replicate_folder
 from neuma_lib.io.files import listed
 from neuma_lib.project import paths
 from neuma_lib.project.settings import NO_TRUTH
@@ -74,9 +75,31 @@ def of_each_video(function):
     return choose
 
 
+def of_each_body(function):
+    """A function of wildcards of a scene of several bodies, applied to the scene of each: a list."""
+
+    @checked
+    def choose(wildcards):
+        return [function(SimpleNamespace(scene=scene)) for scene in SETTINGS.body_scenes(wildcards.scene)]
+
+    return choose
+
+
 def each_of(bodies):
     """Files by name of the bodies of several scenes or experiments."""
     return {name: [result_path(body, file) for body in bodies] for name, file in BODY.items()}
+
+
+def of_pile(function):
+    """A function of wildcards of the scene of one body, applied to the scene of all bodies, in its replicate."""
+
+    @checked
+    def choose(wildcards):
+        base, seeds = SETTINGS.replicate(wildcards.scene)
+        pile, _ = SETTINGS.scenes[base].part_of
+        return function(SimpleNamespace(scene=replicate_folder(pile, seeds)))
+
+    return choose
 
 
 def of_section(choose):
@@ -106,6 +129,8 @@ def origin_of(part, scene):
     """
     if SETTINGS.scenes[scene].bodies:
         return "made"
+    if SETTINGS.scenes[scene].part_of:
+        return "part"
     if not SETTINGS.scenes[scene].has_truth:
         return "captured" if SETTINGS.scenes[scene].captured else "none"
     if getattr(SETTINGS.scenes[scene].images, "dynamic" if part == "truth" else part):
@@ -208,7 +233,10 @@ def densities_of(scenes):
 
 
 def body_settings(*keys):
-    """A function of wildcards: the named settings of the bodies of a scene or experiment."""
+    """A function of wildcards: the named settings of the bodies of a scene or experiment.
+
+    Those of a scene of several bodies have a ``name`` as well.
+    """
     return by_subject(
         lambda scene: (
             [{key: body[key] for key in ("name", *keys)} for body in SETTINGS.scene_bodies(scene)]
@@ -222,8 +250,8 @@ def body_settings(*keys):
 
 
 def has_separate_bodies(wildcards):
-    """Whether the bodies of a scene touch each other with friction. Those of an experiment stick."""
-    return by_subject(lambda scene: bool(SETTINGS.scene(scene).bodies), lambda experiment: False)(wildcards)
+    """Whether the bodies of a scene or an experiment touch each other with friction. Others stick."""
+    return len(SETTINGS.touching_bodies(subject(wildcards))[1]) > 1
 
 
 def solid_meshes(every=True):
@@ -249,8 +277,10 @@ def reconstructed_files(name):
 
     @checked
     def choose(wildcards):
-        bodies = SETTINGS.experiment(subject(wildcards)).bodies
         scenes = SETTINGS.body_scenes(subject(wildcards))
-        return [result_path(scene, name) for body, scene in zip(bodies, scenes) if body.shape is None]
+        bodies = by_subject(SETTINGS.scene_bodies, SETTINGS.experiment_bodies)(wildcards)
+        return [
+            result_path(scene, name) for body, scene in zip(bodies, scenes) if body.get("reconstructed", True)
+        ]
 
     return choose

@@ -18,6 +18,7 @@ from neuma_lib.project.project import remember_settings, remembered_settings
 from neuma_lib.errors import InputError
 from neuma_lib.mechanics.catalogue import DEFINED_IN
 from neuma_lib.methods.registry import methods
+from workflow import preloaded
 from workflow.defaults import complete, digest_of
 from workflow.provenance import code_digest
 from workflow.progress import show_one_line_a_job
@@ -62,10 +63,12 @@ EITHER_GPU = int(GPU and HAS_CUDA)
 # Scripts run in separate processes. They find the library, share one kernel cache, and use one thread each (two OpenMP
 # threads on a busy machine are far slower than one). NEUMA_GPUS is the number of GPUs to spread them over.
 THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
-SPREAD = [str(ROOT / "workflow" / "gpus")] if os.environ.get("NEUMA_GPUS") else []
+INTERPRETER = ROOT / "workflow" / "interpreter"
 os.environ.update(
     {
-        "PYTHONPATH": os.pathsep.join([*SPREAD, str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]),
+        "PYTHONPATH": os.pathsep.join(
+            [str(INTERPRETER), str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
+        ),
         "NEUMA_KERNEL_CACHE": str(Path(SETTINGS.kernel_cache).resolve()),
         **{name: os.environ.get(name, "1") for name in THREAD_LIMITS},
     }
@@ -88,6 +91,8 @@ onstart:
             ) from None
     for scene in {job.wildcards_dict.get("scene") for job in workflow.dag.needrun_jobs()} - {None}:
         checked(remember_settings)(RESULTS, scene, workflow.configfiles, ROOT)
+    if workflow.local_exec and not GPU:
+        preloaded.start()
 
 
 def names_of(scenes, replicates=True):
@@ -102,10 +107,18 @@ def scenes_that(holds, replicates=True):
 
 # Scenes of captures and of splats have no truth. Takes have the body and the motion from registration.
 TRUE_SCENE = scenes_that(lambda scene: scene.has_truth)
+# A scene of several bodies has a scene for each of them, which sees nothing of the others.
 PILE_SCENE = scenes_that(lambda scene: scene.bodies)
+PART_SCENE = scenes_that(lambda scene: scene.part_of)
+SINGLE_SCENE = scenes_that(lambda scene: not scene.bodies)
+LONE_SCENE = scenes_that(lambda scene: scene.has_truth and not scene.part_of)
 SPLAT_SCENE = scenes_that(lambda scene: scene.splat)
-OBJECT_SCENE = scenes_that(lambda scene: not (scene.captured and scene.captured.throw))
-PICTURED_SCENE = scenes_that(lambda scene: not scene.splat and not (scene.captured and scene.captured.throw))
+OBJECT_SCENE = scenes_that(lambda scene: not (scene.bodies or scene.captured and scene.captured.throw))
+PICTURED_SCENE = scenes_that(
+    lambda scene: not (
+        scene.splat or scene.bodies or scene.part_of or scene.captured and scene.captured.throw
+    )
+)
 TAKE_SCENE = scenes_that(lambda scene: scene.captured and scene.captured.throw, replicates=False)
 # Experiments have their own folder. Rules that also accept scenes have the wildcard `scene` for both.
 EXPERIMENT = f"experiments/{names_of(SETTINGS.experiments)}"

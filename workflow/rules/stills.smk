@@ -16,6 +16,27 @@ rule still_fit:
         "../scripts/still_fit.py"
 
 
+rule swing:
+    input:
+        unpack(checked(lambda wildcards: swing_inputs(wildcards.swing))),
+        kernels=kernels("laws"),
+    output:
+        result=f"{RESULTS}/swings/{{swing}}.json",
+        figure=f"{RESULTS}/swings/{{swing}}.png",
+    wildcard_constraints:
+        swing=names_of(RESTING.swings, replicates=False),
+    resources:
+        runtime=120,
+    params:
+        body=lambda wildcards: RESTING.bodies[RESTING.swings[wildcards.swing].body].plain(),
+        swing=lambda wildcards: RESTING.swings[wildcards.swing].plain(),
+        root=RESTING.root,
+        size=RESTING.sizes[0],
+        cells=RESTING.cells,
+    script:
+        "../scripts/swing.py"
+
+
 rule stills_table:
     input:
         results=checked(lambda wildcards: resting_results()),

@@ -45,13 +45,14 @@ def main(inputs, output, params, run) -> None:
         meshes.append(mesh)
         motion = {key: start[key] for key in INITIAL_MOTION}
         counts = {"particles": len(body.x0), "gaussians": len(body.gaussians)}
-        starts.append({"scene": entry["scene"], **motion, **counts})
+        named = {"name": entry["name"]} if "name" in entry else {}
+        starts.append({**named, "scene": entry["scene"], **motion, **counts})
     together, surface = join(bodies), trimesh.util.concatenate(meshes)
     save_gaussians(output.gaussians, together.gaussians)
     save_particles(output.particles, together.x0, together.vol0, {})
     save_binding(output.binding, together.binding)
     write_mesh(output.mesh, np.asarray(surface.vertices), np.asarray(surface.faces))
-    write_json(output.velocity, {"bodies": starts})
+    write_json(output.velocity, {"bodies": starts, "separate": params.separate})
     run.log(f"{len(bodies)} bodies, {len(together.x0)} particles, {len(together.gaussians)} Gaussians")
 
 

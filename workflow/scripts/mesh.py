@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import torch
+
 from neuma_lib.capture.gates import check_volume, draw_body
 from neuma_lib.capture.pictures import evidence
 from neuma_lib.config.geometry import SurfaceConfig
@@ -9,8 +11,10 @@ from neuma_lib.config.photographs import PhotographsConfig
 from neuma_lib.geometry.surface import photographed, reconstruct
 from neuma_lib.geometry.visual_hull import visual_hull
 from neuma_lib.io.gaussians import load_gaussians
+from neuma_lib.io.images import read_hidden
 from neuma_lib.io.mesh import write_mesh
 from neuma_lib.io.photographs import load_static
+from neuma_lib.splatting.labels import without_others
 from workflow.stage import run_script
 
 _HULL_RESOLUTION = 48  # voxels along the longest side of the visual hull, to compare volumes
@@ -19,7 +23,10 @@ _HULL_RESOLUTION = 48  # voxels along the longest side of the visual hull, to co
 def main(inputs, output, params, run) -> None:
     views = load_static(inputs.transforms, PhotographsConfig(**params.photographs))
     surface = SurfaceConfig(**params.surface)
-    mesh = reconstruct(load_gaussians(inputs.gaussians), views.cameras, views.images, surface, views.floor)
+    gaussians, images, hidden = load_gaussians(inputs.gaussians), views.images, read_hidden(inputs.transforms)
+    if hidden is not None:
+        images = without_others(gaussians, views.cameras, images, torch.from_numpy(hidden))
+    mesh = reconstruct(gaussians, views.cameras, images, surface, views.floor)
     if views.photographs:
         mesh = photographed(mesh, views.photographs.edge, views.floor)
         masks, name = [image[..., 3] for image in views.images], Path(inputs.transforms).parent.parent.name

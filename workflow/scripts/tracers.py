@@ -14,7 +14,8 @@ def main(inputs, output, params, run) -> None:
     names = ("tracers", "tracers_again")
     truth, _ = read_arrays(inputs.truth, only=names, required=names)
     floor = chamfer_sequence(*(torch.from_numpy(truth[name]) for name in reversed(names)))
-    starts = np.asarray(sample_tracers(read_mesh(inputs.mesh), params.tracers, seed=params.seed), np.float32)
+    count = params.tracers or truth["tracers"].shape[1]
+    starts = np.asarray(sample_tracers(read_mesh(inputs.mesh), count, seed=params.seed), np.float32)
     write_arrays(output.tracers, {"starts": starts, "floor": floor.numpy()})
     run.log(f"{len(starts)} tracers, sampling floor {float(floor.mean()):.3f}e-4 m^2")
 

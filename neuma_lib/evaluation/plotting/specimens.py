@@ -1,7 +1,11 @@
-"""Records of markers on a released beam, next to the motion of the fitted law."""
+"""Released bodies: records of markers next to the motion of the fitted law, and silhouettes that are predicted."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
 from matplotlib.figure import Figure
 
 from neuma_lib.evaluation.plotting.style import GREY, PAGE, SEQUENCE, new_figure, styled
@@ -29,4 +33,34 @@ def specimen_figure(fit: SpecimenFit) -> Figure:
     grid[0, 0].legend(ncols=3, loc="upper right", frameon=False)
     for axes in grid[-1]:
         axes.set_xlabel("time after the release [s]")
+    return figure
+
+
+@styled
+def swing_figure(result: Mapping[str, Any]) -> Figure:
+    """Predicted silhouettes of a released body on the finest grid, and their distances from the observed ones.
+
+    Args:
+        result: of `fitting.swing.swing_record`.
+    """
+    figure = new_figure(PAGE, 2.4)
+    pictures, distances = figure.subplots(1, 2, width_ratios=(3, 2))
+    clamps, times = result["clamps"], [1e3 * time for time in result["times"]]
+    best = min(clamps.values(), key=lambda own: own["grids"][-1]["predicted"]["contour_rms"])
+    for lines, time, colour in zip(best["silhouettes"], times, SEQUENCE, strict=False):
+        outer = np.array(max(lines, key=len))
+        pictures.plot(*outer.T, color=colour, linewidth=0.8, label=f"{time:.0f} ms")
+    pictures.set_aspect("equal")
+    pictures.invert_yaxis()
+    pictures.set_xlabel("predicted outline [px]")
+    pictures.legend(loc="upper left", frameon=False)
+    for (name, own), colour in zip(clamps.items(), SEQUENCE, strict=False):
+        for key, dash in (("predicted", "-"), ("fitted", ":")):
+            values = own["grids"][-1][key]["contour_rms_by_frame"]
+            label = f"clamp {name}, {key}"
+            distances.plot(times, values, "o", linestyle=dash, color=colour, markersize=2.5, label=label)
+    distances.set_ylim(0)
+    distances.set_xlabel("time [ms]")
+    distances.set_ylabel("distance of the contour, rms [px]")
+    distances.legend(frameon=False)
     return figure

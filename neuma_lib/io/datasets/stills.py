@@ -4,11 +4,15 @@ A folder has ``frames.json``, record -> ``frames``, a list of photographs: ``fil
 ``marker_corners_px`` (top left, top right, bottom right, bottom left). ``calibration.json`` has ``colour`` with ``fx``,
 ``fy``, ``cx``, ``cy`` [px] and ``marker`` with ``side_m``. Centres of first pixels are at (0, 0) in these files, and at
 (0.5, 0.5) in this library.
+
+A folder of a swing has ``times.json``, with ``figures``, number -> time [s], and ``label_NN.png`` for each of them: 255
+body, 0 background, others unknown. They are pictures of the second camera of ``calibration.json``, ``depth``, with
+``colour_to_depth_rotation`` and ``colour_to_depth_translation_m``.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -32,12 +36,16 @@ class Still:
         K: intrinsics, pixel centres at half integers, shape (3, 3) [px].
         marker: corners in the marker's frame, x right, y up, z towards the viewer, shape (M, 3) [m].
         marker_pixels: shape (M, 2) [px].
+        camera: from the frame of the first camera of the record to that of this one, shape (4, 4).
+        unknown: pixels that may show the body, shape (H, W). None: there are none.
     """
 
     mask: NDArray[np.bool_]
     K: Array
     marker: Array
     marker_pixels: Array
+    camera: Array = field(default_factory=lambda: np.eye(4))
+    unknown: NDArray[np.bool_] | None = None
 
 
 def still_files(root: str | Path, record: str, key: str) -> list[str]:
@@ -62,12 +70,10 @@ def read_stills(root: str | Path, record: str) -> list[Still]:
         InputError: a file is missing or damaged, or there is no such record.
     """
     masks = still_files(root, record, "mask")
+    K = _intrinsics(root, "colour")
     path = Path(root, "calibration.json")
     with reading(path, "a calibration"):
-        values = read_json(existing(path))
-        fx, fy, cx, cy = (float(values["colour"][key]) for key in ("fx", "fy", "cx", "cy"))
-        marker = float(values["marker"]["side_m"]) * _CORNERS
-    K = np.array([[fx, 0.0, cx + 0.5], [0.0, fy, cy + 0.5], [0.0, 0.0, 1.0]])
+        marker = float(read_json(path)["marker"]["side_m"]) * _CORNERS
     stills = []
     for mask, frame in zip(masks, read_json(Path(root, "frames.json"))[record]["frames"], strict=True):
         with reading(Path(root, "frames.json"), f"marker corners of {record}"):
@@ -75,3 +81,44 @@ def read_stills(root: str | Path, record: str) -> list[Still]:
         with reading(mask, "an image"), Image.open(existing(mask)) as image:
             stills.append(Still(np.asarray(image.convert("L")) > 127, K, marker, corners + 0.5))
     return stills
+
+
+def swing_files(root: str | Path, folder: str) -> dict[float, str]:
+    """Label maps of a swing, by their times [s].
+
+    Raises:
+        InputError: the folder has no times.
+    """
+    path = Path(root, folder, "times.json")
+    with reading(path, "times of the label maps of a swing"):
+        times = read_json(existing(path, "Give the folder of the records as stills.root"))["figures"]
+        return {float(t): str(path.parent / f"label_{int(k):02d}.png") for k, t in times.items()}
+
+
+def read_swing(root: str | Path, folder: str) -> dict[float, Still]:
+    """Silhouettes of a swing by their times [s], without markers.
+
+    Raises:
+        InputError: a file is missing or damaged.
+    """
+    K, path, camera = _intrinsics(root, "depth"), Path(root, "calibration.json"), np.eye(4)
+    with reading(path, "the pose of the second camera"):
+        values = read_json(path)
+        camera[:3, :3] = values["colour_to_depth_rotation"]
+        camera[:3, 3] = values["colour_to_depth_translation_m"]
+    stills = {}
+    for time, file in swing_files(root, folder).items():
+        with reading(file, "an image"), Image.open(existing(file)) as image:
+            labels = np.asarray(image.convert("L"))
+        unknown = (labels > 0) & (labels < 255)
+        stills[time] = Still(labels == 255, K, np.empty((0, 3)), np.empty((0, 2)), camera, unknown)
+    return stills
+
+
+def _intrinsics(root: str | Path, camera: str) -> Array:
+    """K (3, 3) [px] of a camera of calibration.json."""
+    path = Path(root, "calibration.json")
+    with reading(path, "a calibration"):
+        values = read_json(existing(path))
+        fx, fy, cx, cy = (float(values[camera][key]) for key in ("fx", "fy", "cx", "cy"))
+    return np.array([[fx, 0.0, cx + 0.5], [0.0, fy, cy + 0.5], [0.0, 0.0, 1.0]])

@@ -1,0 +1,1 @@
+"""Commands of ``neuma`` by room. Each loads what it needs when it runs."""
