@@ -557,7 +557,7 @@ def test_a_plateau_widens_what_is_not_determined(flat):
 def test_a_fit_that_ends_before_the_minimum_of_a_quadratic_is_on_no_plateau(level):
     """It is 0.8 of the step away, where the cost on one side is hardly higher. Above the slope it is the quadratic."""
     chosen = settings({"hencky": ELASTIC}, spread=2.0, determined=0.1, level_plateaus=level)
-    run = FamilyRun(Family("hencky", ELASTIC), [None], [0], chosen)
+    run = FamilyRun(Family("hencky", ELASTIC), [SimpleNamespace(deviations=9)], [0], chosen)
     H, away = np.pad(np.diag([1e4, 5.0]), (0, 9)), np.eye(11)[1] * 0.4
     run.fit = Linearisation(H[None], np.zeros((1, 11)), away @ H @ away, 1.0)
     run._covariance = lambda: np.diag([1e-4, 0.25] + [0.0] * 9)
