@@ -21,7 +21,9 @@ from neuma_lib.project.settings import Config
 
 
 def law_source(settings: Config, scene: str, method: str) -> ModelSource | None:
-    """The source of a method's law; None if its motion follows from no law."""
+    """The source of a method's law; None if its motion follows from no law, or from those of several bodies."""
+    if settings.scene(scene).bodies:
+        return None
     case = cases.case(settings, scene, method)
     return case.source() if case.method.has_law else None
 
@@ -41,7 +43,7 @@ def scene_files(settings: Config, scene: str, methods: Sequence[str]) -> SceneFi
             cases.title(settings, method),
             f"{results}/{scene}/{method}/rollout.h5",
             law_source(settings, scene, method),
-            cases.gaussian_motion(settings, scene, method),
+            cases.gaussian_motion(settings, settings.body_scenes(scene)[0], method),
         )
         for method in methods
     )
@@ -53,7 +55,7 @@ def scene_files(settings: Config, scene: str, methods: Sequence[str]) -> SceneFi
         simulation={"dt": chosen.dt, **constants},
         density=chosen.plain()["density"],
         **{name.partition(".")[0]: paths.result_path(settings, scene, name) for name in names},
-        truth=f"{data}/{base}/truth.h5" if chosen.has_truth else None,
+        truth=f"{data}/{base}/truth.h5" if chosen.has_truth or chosen.bodies else None,
         transforms=None if chosen.splat else f"{data}/{base}/dynamic/transforms.json",
         runs=runs,
         roots=(results, data),

@@ -208,7 +208,7 @@ def _predicted(files: SceneFiles, run: RunFiles, body: Reconstruction, notes: li
     steps, dt = _steps(arrays, len(x)), float(attributes.get("dt", files.simulation["dt"]))
     law = None
     if run.law is None:
-        notes.append(f"{run.title}: springs have no stress")
+        notes.append(f"{run.title}: no stress, as its motion follows from no single law")
     else:
         try:
             law = run.law.load(files.checked).law

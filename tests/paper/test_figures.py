@@ -285,6 +285,7 @@ def test_same_data_same_bytes(name, tmp_path):
 def test_every_figure_has_caption_rule_and_test():
     rules = (ROOT / "workflow/rules/figure_table.smk").read_text()
     listed = set(re.findall(r'^    (?:"|\*\*of_each_method\(")(\w+)"(?:: \{|, \w+\),)$', rules, re.MULTILINE))
+    listed |= set(re.findall(r'^    FIGURES\["(\w+)"\] = \{$', rules, re.MULTILINE))
     modules = [path for path in (ROOT / "neuma_lib/paper/figures").glob("*.py") if path.stem != "__init__"]
     assert {path.stem for path in modules} == listed == set(DATA)
     for path in modules:

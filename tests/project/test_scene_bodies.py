@@ -5,7 +5,8 @@ import yaml
 
 from neuma_lib.io.simulator import simulator
 from neuma_lib.project import checks
-from neuma_lib.project.cases import case
+from neuma_lib.project.cases import body_cases, case
+from neuma_lib.project.find import scene_files
 from neuma_lib.project.loading import merged
 from neuma_lib.sim.bodies import Pair
 from tests.conftest import ROOT
@@ -95,3 +96,17 @@ def test_a_pile_has_no_material_of_its_own(with_pile, changed):
         with_pile(experiments={"x": {"title": "X", "bodies": [body], "steps": 9}})
     with refused("scenes.ClayCat.videos"):
         changed(scenes={"Pile": PILE, "ClayCat": {"videos": ["Pile"]}})
+
+
+def test_files_of_a_pile_for_the_viewer(with_pile):
+    """Its motion follows from several laws, and its bodies are identified in one file."""
+    files = scene_files(with_pile(), "Pile", ["constants"])
+    assert files.truth == "data/Pile/truth.h5" and files.binding == "results/Pile/binding.h5"
+    (run,) = files.runs
+    assert run.law is None and run.gaussian_motion == "affine"
+    bodies = body_cases(with_pile(), "Pile", "constants")
+    assert [body.together for body in bodies] == [
+        ("results/Pile/identified.json", name) for name in PILE["bodies"]
+    ]
+    (alone,) = body_cases(with_pile(), "Pile_duck", "constants")
+    assert alone.together is None

@@ -3,7 +3,7 @@
 
 rule binding:
     input:
-        kernels=kernels("binding"),
+        kernels=kernels("geometry"),
         gaussians=of_replicate("gaussians.ply"),
         sampled=of_replicate("sampled_particles.h5"),
     output:

@@ -105,9 +105,9 @@ rule predict:
 
 rule video:
     input:
-        unpack(of_case(lambda case: case.method.body_inputs(case))),
+        unpack(of_bodies(lambda bodies: bodies[0].method.body_inputs(bodies[0]))),
         **body_files(),
-        kernels=of_case(body_kernels),
+        kernels=of_bodies(lambda bodies: body_kernels(bodies[0])),
         transforms=of_data("dynamic/transforms.json"),
         rollout=f"{RESULTS}/{{scene}}/{{method}}/rollout.h5",
     output:
@@ -116,7 +116,7 @@ rule video:
         gpu=GPU,
     params:
         density=scene_setting("density"),
-        method=of_case(body_parameter),
+        method=of_bodies(lambda bodies: body_parameter(bodies[0])),
         particle_source=of_bodies(particle_source),
         gaussian_motion=gaussian_motion,
         view=SETTINGS.evaluation.video_view,

@@ -29,7 +29,8 @@ def data(inputs, params, log) -> ImageGrid:
         rows.append(rendering.renders(bodies[k], cameras, *(state[at] for state in motion)))
     columns = rendering.milliseconds(np.asarray(steps), params.dt)
     log(f"{len(rows)} rows at {', '.join(columns)}")
-    return ImageGrid(np.stack(rows), tuple(params.titles), tuple(columns))
+    (cut,) = rendering.cropped([np.concatenate(rows)])
+    return ImageGrid(cut.reshape(len(rows), -1, *cut.shape[1:]), tuple(params.titles), tuple(columns))
 
 
 @style.styled
