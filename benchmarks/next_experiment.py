@@ -1,43 +1,51 @@
-"""Chosen second launches against random ones: standard deviations and errors of the constants after a joint fit.
+"""Chosen next experiments against random ones: standard deviations and errors of the constants after joint fits.
 
-    python -m benchmarks.next_experiment --seeds 1 --count 6 --random 2 --candidates 16 --out chosen.json
+    python -m benchmarks.next_experiment config/studies/next_experiment.yaml --jobs 64 --out chosen.json \
+        --page docs/results/next_experiment.md
 
-Materials, shapes and first launches are the random scenes of development seeds. Videos are renders of the true body,
-filled with particles that have one Gaussian each. The reconstruction has other and fewer particles and Gaussians, so
-that residuals are correlated errors of a reconstruction. There is no Blender and no fit of Gaussians, hence a material
-takes about a core minute. Only the true family is fitted. The choice does not read the truth. Results are
-written after each material, and materials in the file are skipped.
+Materials, shapes and first launches are the random scenes of the settings, the last ``--outside`` of them of materials
+outside the families. Videos are renders of the true body, filled with particles that have one Gaussian each. The
+reconstruction has other and fewer particles and Gaussians, so that residuals are correlated errors of a reconstruction.
+There is no Blender and no fit of Gaussians. The choice does not read the truth.
+
+Each material has tasks that run in parallel. In "pool" tasks, every candidate of the first choice is done, and the true
+family is fitted (of materials outside, the identified one): the chosen one, the best in hindsight and the mean of the
+random launches are all from this pool. In "loop" tasks, all families are fitted to chosen or random experiments one
+after the other, until all constants are determined. Results are written after each task, and finished tasks are
+skipped.
 """
 
 from __future__ import annotations
 
-import argparse
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
-from benchmarks.timing import core_seconds
+from benchmarks.timing import core_seconds, parser_of
 from neuma_lib.config.blender import AppearanceConfig
 from neuma_lib.config.identify import IdentifyConfig
-from neuma_lib.config.next import NextConfig
 from neuma_lib.coupling.bodies import coloured_solid
 from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.data.blender.appearance import colors_at
 from neuma_lib.errors import InputError, NonFiniteError
+from neuma_lib.evaluation.text_tables import as_markdown
 from neuma_lib.fitting.candidate_experiments import as_cameras, placed
-from neuma_lib.fitting.choose_next import Option, choose_next
-from neuma_lib.fitting.identified import FamilyFit
+from neuma_lib.fitting.choose_next import Option, Selection, choose_next, read_rivals
+from neuma_lib.fitting.identified import FamilyFit, Identified
 from neuma_lib.fitting.identify import identify
-from neuma_lib.fitting.next_experiment import Experiment, stds
+from neuma_lib.fitting.next_experiment import Experiment, stds, undetermined
 from neuma_lib.geometry.shapes import place
 from neuma_lib.geometry.volume import sample_volume
-from neuma_lib.io.files import read_json, write_json
+from neuma_lib.io.files import read_json, write_json, write_text
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.combinations import physical
 from neuma_lib.project.loading import load, merged, read_yaml
@@ -48,21 +56,53 @@ from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.observation import Observation
 from neuma_lib.splatting.viewpoints import video_views
 
-GRID, COARSER = 20, 1.6  # cells, and the time step over that of the scene
-TRUE, RECONSTRUCTED = 4000, 1200  # particles
-FRAMES, PIXELS = 25, 96
 STD = np.array([0.01, 0.01, 0.03, 0.05, 0.05, 0.05])  # of the estimate of the initial motion [m/s, rad/s]
-STEPS = 32  # the steps of a video are a multiple of this
+CHUNKS = 4  # tasks of a pool
+EXPERIMENTS = 6  # of a loop, with the first one
+Video = tuple[InitialMotion, Reconstruction, Observation]
 
 
-@dataclass
+@dataclass(frozen=True)
+class Task:
+    """Work on a material: kind "pool" with the number of its chunk, or "loop" with 1 for chosen experiments, else 0."""
+
+    scene: str
+    kind: str
+    number: int
+
+
 class Lab:
-    """A hidden material and its object, which films launches."""
+    """A hidden material and its object, which films experiments.
 
-    law: dict[str, Any]
-    truth: Reconstruction
-    body: Reconstruction
-    random: np.random.Generator
+    Args:
+        settings: with the random scenes.
+        name: of a scene.
+    """
+
+    def __init__(self, settings: Config, name: str):
+        self.settings, self.scene = settings, settings.scene(name)
+        number = list(settings.random_scenes).index(name)
+        self.random = np.random.default_rng([settings.random.seed, number])
+        simulation = settings.simulation
+        self.model = MPM(
+            simulation.grid, self.scene.dt, simulation.gravity, simulation.boundary, simulation.contact
+        )
+        self.law = self.scene.plain()["law"]
+        self.family = settings.random.family(name)
+        self.truth = self._solid(settings.dataset.particles, 1000)
+        self.body = self._solid(settings.geometry.particles, 1)
+        self.first = self.film(
+            self.model, self.truth, self.body, self.scene.velocity, self.scene.spin, self.scene.steps
+        )
+
+    def _solid(self, count: int, seed: int) -> Reconstruction:
+        """The object, filled with particles."""
+        scene = self.scene
+        mesh = place(scene.shape, scene.size, scene.height, scene.center)
+        x0 = sample_volume(mesh, count, seed=seed)
+        colors = torch.from_numpy(colors_at(mesh, x0, AppearanceConfig(**scene.plain()["appearance"])))
+        body = coloured_solid(mesh, torch.as_tensor(x0, dtype=torch.float32), 1000.0, colors)
+        return replace(body, gaussians=body.gaussians.to(dtype=torch.float32), affine=False)
 
     @torch.no_grad()
     def film(
@@ -73,154 +113,329 @@ class Lab:
         velocity: Sequence[float],
         spin: Sequence[float],
         steps: int,
-    ) -> tuple[InitialMotion, Reconstruction, Observation]:
+    ) -> Video:
         """An estimate of the initial motion, the reconstruction at the start, and the video."""
-        frames = tuple(round(k * steps / (FRAMES - 1)) for k in range(FRAMES))
-        start = truth.state(velocity, spin)
-        path = rollout(model, analytic_law(self.law, model.dt), start, steps=steps, frames=frames, total=True)
-        like = Cameras(torch.eye(4)[None], torch.eye(3)[None], PIXELS, PIXELS)
-        cameras = as_cameras(video_views(path.x.flatten(0, 1).numpy(), 1, PIXELS, PIXELS), like)
+        count, pixels = self.settings.dataset.frames, self.settings.dataset.dynamic.width
+        frames = tuple(round(k * steps / (count - 1)) for k in range(count))
+        law, start = analytic_law(self.law, model.dt), truth.state(velocity, spin)
+        path = rollout(model, law, start, steps=steps, frames=frames, total=True)
+        like = Cameras(torch.eye(4)[None], torch.eye(3)[None], pixels, pixels)
+        cameras = as_cameras(video_views(path.x.flatten(0, 1).numpy(), 1, pixels, pixels), like)
         images = truth.particle_gs(cameras)(path.x, path.stretch)
         axes = cameras.viewmats[0, :3, :3].double().numpy()
         centre = (body.mass @ body.x0 / body.mass.sum()).double().numpy()
         std = np.zeros(6) if model.clamps else STD
         exact = InitialMotion(np.array(velocity), np.array(spin), centre, axes, std)
-        motion = exact.moved(self.random.standard_normal(6))
-        return motion, body, Observation(frames, images, cameras)
+        return exact.moved(self.random.standard_normal(6)), body, Observation(frames, images, cameras)
 
-    def repeat(self, option: Option) -> tuple[InitialMotion, Reconstruction, Observation]:
+    def repeat(self, option: Option) -> Video:
         """Do an experiment that was chosen."""
-        from scipy.spatial.transform import Rotation
-
         own = option.settings
         R = Rotation.from_rotvec(own.get("rotation", (0.0, 0.0, 0.0))).as_matrix()
         centre = (own["center"][0], own["height"], own["center"][1])
         at = [placed(each, R, centre) for each in (self.truth, self.body)]
         return self.film(option.experiment.model, *at, own["velocity"], own["spin"], own["steps"])
 
+    def fitted(
+        self, options: Sequence[Option], families: Sequence[str], before: Identified | None = None
+    ) -> Identified:
+        """What is identified in the first launch and some other experiments, also from what was known ``before``."""
+        models = [self.model, *(option.experiment.model for option in options)]
+        videos = [self.repeat(option) for option in options]
+        start = before and before.best.family.law_spec(before.best.values)
+        return identify(models, *self.first, self.chosen(families), start, other_videos=videos)
 
-def solid(scene, count: int, seed: int) -> Reconstruction:
-    """The object of a scene, filled with particles."""
-    mesh = place(scene.shape, scene.size, scene.height, scene.center)
-    x0 = sample_volume(mesh, count, seed=seed)
-    colors = torch.from_numpy(colors_at(mesh, x0, AppearanceConfig(**scene.plain()["appearance"])))
-    body = coloured_solid(mesh, torch.as_tensor(x0, dtype=torch.float32), 1000.0, colors)
-    return replace(body, gaussians=body.gaussians.to(dtype=torch.float32), affine=False)
+    def chosen(self, families: Sequence[str]) -> IdentifyConfig:
+        known = self.settings.identify
+        own = {name: known.families[name] for name in families}
+        return known.model_copy(update={"families": own, "refined_particles": 0})
 
+    def selection(self, result: Identified, options: Sequence[Option], seed: int) -> Selection:
+        """Ranked candidates after some experiments."""
+        models = [self.model, *(option.experiment.model for option in options)]
+        bodies = [self.body, *(option.experiment.body for option in options)]
+        videos = [[self.first[2]], *(option.experiment.video for option in options)]
+        parts = zip(models, result.best.motions, bodies, videos, strict=True)
+        stds = [self.first[0].std, *(option.experiment.motion.std for option in options)]
+        filmed = [
+            Experiment(model, replace(motion, std=std), body, video)
+            for (model, motion, body, video), std in zip(parts, stds, strict=True)
+        ]
+        rivals = read_rivals(result.as_dict(), result.settings, result.best, len(result.ties))
+        lab, ties = self.settings.next, bool(result.ties)
+        return choose_next(result.best, filmed, result.settings, lab, rivals=rivals, ties=ties, seed=seed)
 
-def measure(settings: Config, name: str, count: int, random: int, seed: int) -> dict[str, Any]:
-    """Standard deviations and errors of the constants of a material after one launch and after two."""
-    scene = settings.scene(name)
-    law = scene.plain()["law"]
-    family = settings.random.family(name)
-    chosen = IdentifyConfig(
-        families={family: settings.identify.families[family]}, refined_particles=0, covariance_from="total"
-    )
-    simulation = settings.simulation
-    model = MPM(GRID, COARSER * scene.dt, simulation.gravity, simulation.boundary, simulation.contact)
-    steps = STEPS * max(1, round(scene.steps / COARSER / STEPS))
-    bodies = [solid(scene, TRUE, 1000), solid(scene, RECONSTRUCTED, 1)]
-    lab = Lab(law, *bodies, np.random.default_rng([seed, 5]))
-    truth = physical({key: value for part in law.values() for key, value in part.items() if key != "name"})
-    first = lab.film(model, *bodies, scene.velocity, scene.spin, steps)
-
-    def summary(fit: FamilyFit) -> dict[str, Any]:
-        logs = {key: math.log(value / truth[key]) for key, value in physical(fit.values).items()}
-        return {"std": stds(fit, chosen), "error": logs}
-
-    def joint(option: Option) -> dict[str, Any]:
-        models = [model, option.experiment.model]
-        both = identify(models, *first, chosen, other_videos=[lab.repeat(option)])
-        return {
-            "settings": option.settings,
-            "predicted": stds(option.forecast.fit, chosen),
-            **summary(both.best),
-        }
-
-    alone = identify(model, *first, chosen)
-    result: dict[str, Any] = {"scene": name, "family": family, "alone": summary(alone.best)}
-    motion, body, video = first
-    filmed = Experiment(model, replace(alone.best.motions[0], std=motion.std), body, [video])
-    limits = NextConfig(kinds=("launch",), candidates=count)
-    started = core_seconds()
-    selection = choose_next(alone.best, [filmed], chosen, limits, seed=seed)
-    result |= {
-        "seconds": core_seconds() - started,
-        "before": selection.before,
-        "chosen": joint(selection.options[0]),
-    }
-    drawn = lab.random.permutation(len(selection.options))[:random]
-    return {**result, "random": [joint(selection.options[k]) for k in drawn]}
+    def summary(self, fit: FamilyFit) -> dict[str, Any]:
+        """Standard deviations, and logarithms of the ratios to the true constants where there are such."""
+        law = {key: value for part in self.law.values() for key, value in part.items() if key != "name"}
+        truth, values = physical(law), physical(fit.values)
+        errors = {key: math.log(values[key] / truth[key]) for key in values.keys() & truth.keys()}
+        return {"family": fit.family.name, "std": stds(fit, self.settings.identify), "error": errors}
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--seeds", type=int, nargs="+", default=[1], help="development seeds of random scenes"
-    )
-    parser.add_argument("--count", type=int, default=6, help="materials of each seed")
-    parser.add_argument("--candidates", type=int, default=40)
-    parser.add_argument("--random", type=int, default=2, help="random second launches of each material")
-    parser.add_argument("--out", type=Path, required=True)
-    options = parser.parse_args()
+def run(settings: Config, task: Task) -> dict[str, Any]:
+    """The result of a task in plain values."""
     torch.set_num_threads(1)
-    results = read_json(options.out) if options.out.is_file() else []
-    for seed in options.seeds:
-        raw = merged(read_yaml("config/config.yaml"), {"random": {"seed": seed, "count": options.count}})
-        settings = load(raw)
-        if not settings.random.is_development:
-            raise InputError("--seeds", f"{seed} is not a development seed")
-        for name in settings.random_scenes:
-            if any(each["scene"] == name for each in results):
-                continue
-            try:
-                own = measure(settings, name, options.candidates, options.random, seed)
-            except (InputError, NonFiniteError) as error:
-                own = {"scene": name, "refused": str(error)}
-            results.append(own)
-            write_json(options.out, results)
-            print(summary_line(own), flush=True)
-    print_table(results)
+    lab = Lab(settings, task.scene)
+    every = list(settings.identify.families)
+    try:
+        return pool(lab, task.number, every) if task.kind == "pool" else loop(lab, bool(task.number), every)
+    except (InputError, NonFiniteError) as error:
+        return {"refused": str(error)}
 
 
-def spread(std: dict[str, float]) -> float:
-    return math.exp(float(np.mean(np.log(list(std.values())))))
+def pool(lab: Lab, chunk: int, every: Sequence[str]) -> dict[str, Any]:
+    """All candidates of the first choice, and the joint fits of a part of them."""
+    family = [lab.family] if lab.family in every else [lab.fitted([], every).best.family.name]
+    alone = lab.fitted([], family)
+    started = core_seconds()
+    selection = lab.selection(alone, [], lab.settings.random.seed)
+    seconds = core_seconds() - started
+    done = []
+    for rank, option in list(enumerate(selection.options))[chunk::CHUNKS]:
+        own = {"rank": rank, "kind": option.kind, "predicted": stds(option.forecast.fit, alone.settings)}
+        try:
+            done.append({**own, **lab.summary(lab.fitted([option], family, alone).best)})
+        except NonFiniteError as error:
+            done.append({**own, "refused": str(error)})
+    return {"alone": lab.summary(alone.best), "seconds": seconds, "candidates": done}
 
 
-def summary_line(own: dict[str, Any]) -> str:
-    if "refused" in own:
-        return f"{own['scene']}: {own['refused']}"
-    others = ", ".join(f"{100 * spread(each['std']):.1f}" for each in own["random"])
-    return (
-        f"{own['scene']}: {100 * spread(own['alone']['std']):.1f} %, chosen {100 * spread(own['chosen']['std']):.1f} % "
-        f"(predicted {100 * spread(own['chosen']['predicted']):.1f} %), random {others} %, {own['seconds']:.0f} s"
-    )
+def loop(lab: Lab, choose: bool, every: Sequence[str]) -> dict[str, Any]:
+    """Experiments until all constants are determined, chosen ones or random launches."""
+    options: list[Option] = []
+    rounds, result = [], None
+    for number in range(EXPERIMENTS):
+        result = lab.fitted(options, every, result)
+        rounds.append(
+            {**lab.summary(result.best), "ties": result.ties, "kinds": [option.kind for option in options]}
+        )
+        if not undetermined(result.best, result.settings) and (number or not result.ties):
+            break
+        try:
+            selection = lab.selection(result, options, lab.settings.random.seed + number)
+        except InputError as error:  # nothing is left to determine
+            rounds[-1]["end"] = str(error)
+            break
+        launches = [option for option in selection.options if option.kind == "launch"]
+        options.append(selection.options[0] if choose else launches[int(lab.random.integers(len(launches)))])
+    return {"rounds": rounds}
 
 
-def print_table(results: Sequence[dict[str, Any]]) -> None:
-    """Ratios of the standard deviations, their calibration, and errors in units of them."""
-    done = [each for each in results if "refused" not in each and each["random"]]
-    ratios = [
-        math.log(spread(each["chosen"]["std"]) / spread(other["std"]))
-        for each in done
-        for other in each["random"]
-    ]
-    fits = [fit for each in done for fit in (each["chosen"], *each["random"])]
-    predicted = [math.log(spread(fit["predicted"]) / spread(fit["std"])) for fit in fits]
-    z = [abs(fit["error"][key]) / fit["predicted"][key] for fit in fits for key in fit["predicted"]]
-    if not done:
+def tasks_of(names: Sequence[str]) -> Iterator[Task]:
+    """All tasks, the longest first."""
+    for kind, count in (("loop", 2), ("pool", CHUNKS)):
+        yield from (Task(name, kind, number) for number in range(count) for name in names)
+
+
+def drawn(files: Sequence[Path], outside: int) -> dict[str, Config]:
+    """Settings of each material, of which the last ones are outside the families."""
+    raw = read_yaml("config/config.yaml")
+    for file in files:
+        raw = merged(raw, read_yaml(file))
+    inside, others = (load(merged(raw, {"random": {"draw_from": each}})) for each in ("families", "outside"))
+    names = list(inside.random_scenes)
+    return {name: inside for name in names[: len(names) - outside]} | {
+        name: others for name in list(others.random_scenes)[:outside]
+    }
+
+
+def finished(
+    jobs: int, settings: Mapping[str, Config], tasks: Mapping[str, Task]
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Results of tasks as they finish."""
+    if jobs == 1:
+        yield from ((key, run(settings[task.scene], task)) for key, task in tasks.items())
         return
-    print(f"{len(done)} materials, {len(results) - len(done)} refused")
-    print(f"std of chosen over random launches, geometric mean: {math.exp(float(np.mean(ratios))):.2f}")
-    print(f"chosen better: {sum(ratio < 0 for ratio in ratios)} of {len(ratios)}")
-    quartiles = np.exp(np.quantile(predicted, (0.1, 0.5, 0.9)))
-    print(
-        "predicted over reported std, 10th, 50th and 90th percentile: "
-        + ", ".join(f"{q:.2f}" for q in quartiles)
+    with ProcessPoolExecutor(jobs, get_context("spawn")) as processes:
+        running = {processes.submit(run, settings[task.scene], task): key for key, task in tasks.items()}
+        yield from ((running[future], future.result()) for future in as_completed(running))
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = parser_of(__doc__)
+    parser.add_argument("files", type=Path, nargs="*", help="settings on top of config/config.yaml")
+    parser.add_argument("--outside", type=int, default=3, help="materials outside the families")
+    parser.add_argument("--jobs", type=int, default=1, help="parallel processes of one thread")
+    parser.add_argument("--kinds", nargs="+", default=["loop", "pool"], help="kinds of tasks")
+    parser.add_argument("--out", type=Path, required=True, help="results, which a later run continues")
+    parser.add_argument("--page", type=Path, help="Markdown page to write")
+    options = parser.parse_args(arguments)
+    settings = drawn(options.files, options.outside)
+    results: dict[str, Any] = read_json(options.out) if options.out.is_file() else {}
+    missing = {str(task): task for task in tasks_of(list(settings)) if task.kind in options.kinds}
+    missing = {key: task for key, task in missing.items() if key not in results}
+    for key, result in finished(options.jobs, settings, missing):
+        results[key] = result
+        write_json(options.out, results)
+        print(key, flush=True)
+    by_task = {task: results[str(task)] for task in tasks_of(list(settings)) if str(task) in results}
+    materials = [Material.of(name, own, by_task) for name, own in settings.items()]
+    files = " ".join(map(str, options.files))
+    text = page(
+        materials,
+        f"python -m benchmarks.next_experiment {files} --outside {options.outside} --out {options.out}",
     )
-    print(f"errors within 1 and 2 predicted std: {np.mean(np.less(z, 1)):.2f}, {np.mean(np.less(z, 2)):.2f}")
+    if options.page:
+        write_text(options.page, text)
+    print(text)
+
+
+@dataclass
+class Material:
+    """What the tasks of a material give.
+
+    Attributes:
+        fits: joint fits of the pool with a finite result, in the order of the ranking.
+        alone: the fit to the first launch.
+        rounds: of the loop with random launches, and of that with chosen experiments.
+        inside: whether its family is a candidate.
+        refused: why a task has no result.
+    """
+
+    name: str
+    family: str
+    inside: bool
+    limit: float
+    fits: list[dict[str, Any]]
+    alone: dict[str, Any]
+    rounds: list[list[dict[str, Any]]]
+    refused: str
+
+    @classmethod
+    def of(cls, name: str, settings: Config, results: Mapping[Task, dict[str, Any]]) -> Material:
+        own = {task: result for task, result in results.items() if task.scene == name}
+        pools = [result for result in own.values() if "candidates" in result]
+        fits = [fit for each in pools for fit in each["candidates"] if "std" in fit]
+        family, known = settings.random.family(name), settings.identify
+        rounds = [own.get(Task(name, "loop", k), {}).get("rounds", []) for k in range(2)]
+        refused = "; ".join(
+            dict.fromkeys(result["refused"] for result in own.values() if "refused" in result)
+        )
+        fits.sort(key=lambda fit: fit["rank"])
+        alone = pools[0]["alone"] if pools else {}
+        return cls(name, family, family in known.families, known.determined, fits, alone, rounds, refused)
+
+    def of_kinds(self, *kinds: str) -> list[dict[str, Any]]:
+        return [fit for fit in self.fits if fit["kind"] in kinds]
+
+    def over_random(self, measure: Callable[[dict[str, Any]], float], *kinds: str) -> list[float]:
+        """Logarithm of a measure of the best-ranked experiment of some kinds, or of all, over random launches."""
+        chosen = (self.of_kinds(*kinds) if kinds else self.fits)[:1]
+        launches = self.of_kinds("launch")
+        return (
+            [measure(chosen[0]) - float(np.mean([measure(fit) for fit in launches]))]
+            if chosen and launches
+            else []
+        )
+
+    def over_best(self) -> list[float]:
+        return [log_std(self.fits[0]) - min(map(log_std, self.fits))] if self.fits else []
+
+    def experiments(self, choose: bool) -> list[int]:
+        """Number of experiments until all constants are determined, `EXPERIMENTS` + 1 if they are not."""
+        rounds = self.rounds[choose]
+        done = [k for k, each in enumerate(rounds, 1) if max(each["std"].values()) < self.limit]
+        return [min(done, default=EXPERIMENTS + 1)] if rounds else []
+
+    def distinguished(self) -> list[bool]:
+        """Whether no other family predicts as well after two experiments, and the family is the true one."""
+        after = [each for each in self.rounds[True][:2]][-1:]
+        return [not each["ties"] and (each["family"] == self.family or not self.inside) for each in after]
+
+    def row(self) -> list[Any]:
+        parts = self.fits[:1]
+        stds = [[log_std(self.alone)] if self.alone else [], [log_std(fit, "predicted") for fit in parts]]
+        stds += [list(map(log_std, some)) for some in (parts, self.of_kinds("launch"))]
+        stds += [[min(map(log_std, self.fits))] if parts else []]
+        return [
+            self.name,
+            parts[0]["kind"] if parts else self.refused,
+            *(f"{100 * math.exp(np.mean(each)):.0f} %" if each else "" for each in stds),
+            *("".join(map(str, self.experiments(choose))) for choose in (True, False)),
+        ]
+
+
+def log_std(fit: Mapping[str, Any], key: str = "std") -> float:
+    """Logarithm of the geometric mean of the standard deviations."""
+    return float(np.mean(np.log(list(fit[key].values()))))
+
+
+def log_error(fit: Mapping[str, Any]) -> float:
+    """Logarithm of the root mean square of the errors."""
+    return 0.5 * math.log(np.mean(np.square(list(fit["error"].values()))))
+
+
+NORMAL = {1: "0.68", 2: "0.95"}  # share of a normal distribution within so many standard deviations
+STDS = ("std: one launch", "predicted", "chosen", "random", "best")
+HEADER = ("material", "chosen", *STDS, "experiments: chosen", "random")
+PAGE = """\
+# Chosen next experiments
+
+    {command}
+
+{measures}
+
+{materials}
+
+Standard deviations (std) are geometric means over the constants of those of their logarithms. Errors are root mean
+squares of the logarithms of their ratios to the true ones. The last columns are the numbers of experiments until all
+constants are determined, where {more} stands for more than {limit}.
+"""
+
+
+def page(materials: Sequence[Material], command: str) -> str:
+    """Measures over all materials, and a row for each."""
+    inside = [each for each in materials if each.inside]
+    fits, known = ([fit for each in some for fit in each.fits] for some in (materials, inside))
+    z = [abs(fit["error"][key]) / fit["predicted"][key] for fit in known for key in fit["error"]]
+    calibration = [log_std(fit, "predicted") - log_std(fit) for fit in fits]
+    chosen, random = ([n for each in materials for n in each.experiments(choose)] for choose in (True, False))
+    distinct = [own for each in materials for own in each.distinguished()]
+
+    def ratio(measure: Callable[[dict[str, Any]], float], some: Sequence[Material], *kinds: str) -> str:
+        logs = [value for each in some for value in each.over_random(measure, *kinds)]
+        return f"{math.exp(np.mean(logs)):.2f}" if logs else ""
+
+    best = [value for each in materials for value in each.over_best()]
+    rows = [
+        ["std, chosen experiment over random launches", "0.6", ratio(log_std, materials)],
+        ["std, chosen launch over random launches", "0.6", ratio(log_std, materials, "launch", "turned")],
+        [
+            "std, chosen experiment over the best in hindsight",
+            "1.1",
+            best and f"{math.exp(np.mean(best)):.2f}",
+        ],
+        ["errors, chosen experiment over random launches", "", ratio(log_error, inside)],
+        ["experiments, median of chosen ones", "half of random", chosen and f"{np.median(chosen):g}"],
+        ["experiments, median of random launches", "", random and f"{np.median(random):g}"],
+        *(
+            [
+                f"predicted over reported std, {name}",
+                "1",
+                fits and f"{np.exp(np.quantile(calibration, q)):.2f}",
+            ]
+            for name, q in (("10th percentile", 0.1), ("median", 0.5), ("90th percentile", 0.9))
+        ),
+        *(
+            [f"errors within {k} predicted std", n, z and f"{np.mean(np.less(z, k)):.2f}"]
+            for k, n in NORMAL.items()
+        ),
+        [
+            "families distinguished after two experiments",
+            "22 of 24",
+            distinct and f"{sum(distinct)} of {len(distinct)}",
+        ],
+    ]
+    measures = as_markdown(["measure", "goal", "result"], [row for row in rows if row[2]])
+    table = as_markdown(HEADER, [each.row() for each in materials])
+    return PAGE.format(
+        command=command,
+        measures="\n".join(measures),
+        materials="\n".join(table),
+        limit=EXPERIMENTS,
+        more=EXPERIMENTS + 1,
+    )
 
 
 if __name__ == "__main__":

@@ -37,7 +37,13 @@ def overlay(folder: Path, **settings) -> str:
 
 @core
 def test_the_shipped_settings_have_no_problems(project, capsys):
-    for name in ("demo", "studies/three_chains", "studies/two_throws", "studies/paper_tables"):
+    for name in (
+        "demo",
+        "studies/three_chains",
+        "studies/two_throws",
+        "studies/paper_tables",
+        "studies/next_experiment",
+    ):
         assert main(["check", f"config/{name}.yaml"]) == 0, capsys.readouterr().out
     capsys.readouterr()
     assert main(["check", "config/paper.yaml", "config/studies/paper_stride4.yaml"]) in (0, 1)
@@ -247,7 +253,7 @@ def test_a_chosen_launch_becomes_a_scene_of_the_same_material(project, capsys):
     assert settings.video_scenes("JellyDuck") == ["JellyDuck", "Second"]
     scene = settings.scene("Second")
     assert scene.height == 0.5 and scene.velocity == (0.0, -2.0, 0.0) and scene.steps == 256
-    assert scene.law == settings.scene("JellyDuck").law
+    assert scene.law == settings.scene("JellyDuck").law and settings.identify.start_from_first_video
     assert main(["new", "scene", "Third", "--from", str(folder), "--rank", "2"]) == 1
     assert main(["new", "scene", "Third", "--from", "results/ClayCat"]) == 1
     assert "neuma next" in capsys.readouterr().err

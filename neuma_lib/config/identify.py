@@ -54,6 +54,13 @@ class IdentifyConfig(Section):
         (6, 12, 24, 96), "widths of the images that are fitted in turn", min_length=1
     )
     iterations: int = internal(10, "maximum number of Levenberg-Marquardt steps for each width", ge=1)
+    start_from_first_video: bool = internal(
+        False,
+        "fits to several videos also start from the constants of a fit to the first one",
+    )
+    level_plateaus: bool = internal(
+        False, "plateaus of the loss are measured above its slope where a fit ends before its minimum"
+    )
     min_gain: float = internal(0.01, "predicted relative gain below which a fit stops", gt=0)
     difference: float = internal(0.04, "width of the forward differences of the unbounded constants", gt=0)
     longest_step: float = internal(1.0, "maximum change of an unbounded constant in a step", gt=0)

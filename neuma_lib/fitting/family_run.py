@@ -283,6 +283,10 @@ class FamilyRun:
         The cost is evaluated at two standard deviations along the undetermined principal axes, on the side where it
         increases less. The variance is multiplied by the ratio of the predicted to the actual increase, up to
         `IdentifyConfig.spread`, which accounts for plateaus.
+
+        A fit that ends before its minimum has a slope, by which the cost increases less on one side without a plateau.
+        With `IdentifyConfig.level_plateaus`, the increase is that above the slope between half a standard deviation on
+        either side.
         """
         k, whole = self._constants, self._covariance()
         variances, axes = np.linalg.eigh(whole[:k, :k])
@@ -292,9 +296,15 @@ class FamilyRun:
                 continue
             # The deviations change according to their correlation with the constants.
             step = 2 * whole[:, :k] @ axis / math.sqrt(variance)
-            residuals = self._simulate([self._u + step, self._u - step])
+            points = [self._u + step, self._u - step]
+            if self.settings.level_plateaus:
+                points += [self._u + step / 4, self._u - step / 4]
+            residuals = self._simulate(points)
             costs = [math.inf if residual is None else self._cost(residual) for residual in residuals]
-            predicted, actual = step @ self.fit.curvature @ step, max(min(costs) - self.fit.cost, MIN_COST)
+            near = costs[2:]
+            slope = 2 * (near[0] - near[1]) if near and math.isfinite(sum(near)) else 0.0
+            lowest = min(costs[0] - slope, costs[1] + slope)
+            predicted, actual = step @ self.fit.curvature @ step, max(lowest - self.fit.cost, MIN_COST)
             inflated = min(variance * max(predicted / actual, 1.0), self.settings.spread**2)
             added += (inflated - variance) * np.outer(axis, axis)
         return added

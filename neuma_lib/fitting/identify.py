@@ -285,6 +285,12 @@ def _first_fit(
     elastic limit, if that is better than the result of the first. Redundant fits are used only if there is no other.
     """
     guesses = [family.with_guesses(values) for values in ({}, published_values)]
+    if settings.start_from_first_video and len(videos) > 1:
+        alone = FamilyRun(family, videos[:1], [videos[0].fitted], settings)
+        alone.begin(guesses)
+        for level in range(1, len(settings.pyramid) if alone.alive else 1):
+            alone.refine(level, rough=True)
+        guesses += [alone.values] if alone.alive else []
     fitted = [family.with_guesses(values) for values in _fitted_values(running, family)]
     groups = [[*guesses, *fitted]]
     if family.flows and fitted:

@@ -214,6 +214,26 @@ def test_videos_have_their_own_colliders_and_clamps():
         identify([*models, MODEL], *videos[0], chosen, other_videos=videos[1:])
 
 
+def test_a_joint_fit_starts_from_that_to_the_first_video(monkeypatch):
+    """From its constants at the last level."""
+    begun, begin = [], FamilyRun.begin
+
+    def recorded(run, starts, *args, **options):
+        begin(run, starts, *args, **options)
+        begun.append((run, list(starts)))
+
+    monkeypatch.setattr(FamilyRun, "begin", recorded)
+    body, seen = video_of(ELASTIC, V0, FRAMES[:11])
+    others = [(known(body), body, seen)]
+    options = dict(pyramid=(8, 32), start_from_first_video=True)
+    identified_in(ELASTIC, {"hencky": ELASTIC}, other_videos=others, **options)
+    (alone, _), (both, starts), *_ = begun
+    assert (len(alone.videos), len(both.videos)) == (1, 2) and alone.refined and alone.values in starts
+    begun.clear()
+    identified_in(ELASTIC, {"hencky": ELASTIC}, other_videos=others, pyramid=(8, 32))
+    assert all(len(run.videos) == 2 for run, _ in begun)
+
+
 def test_videos_count_alike_however_long():
     """The same video again, in half as many frames: the loss is the mean of both, the estimate is the same."""
     families, truth = {"hencky": ELASTIC}, law("hencky", E=3e4, nu=0.4)
@@ -531,6 +551,20 @@ def test_a_plateau_widens_what_is_not_determined(flat):
     added = run.covariance_of_plateaus()
     np.testing.assert_allclose(added, np.diag([0.0, min(0.25 * flat, 4.0) - 0.25]), atol=1e-9)
     assert len(tried) == 2 and all(abs(u[1]) == pytest.approx(1.0) for u in tried)
+
+
+@pytest.mark.parametrize("level", [False, True])
+def test_a_fit_that_ends_before_the_minimum_of_a_quadratic_is_on_no_plateau(level):
+    """It is 0.8 of the step away, where the cost on one side is hardly higher. Above the slope it is the quadratic."""
+    chosen = settings({"hencky": ELASTIC}, spread=2.0, determined=0.1, level_plateaus=level)
+    run = FamilyRun(Family("hencky", ELASTIC), [SimpleNamespace(deviations=9)], [0], chosen)
+    H, away = np.pad(np.diag([1e4, 5.0]), (0, 9)), np.eye(11)[1] * 0.4
+    run.fit = Linearisation(H[None], np.zeros((1, 11)), away @ H @ away, 1.0)
+    run._covariance = lambda: np.diag([1e-4, 0.25] + [0.0] * 9)
+    run._simulate, run._cost = lambda points: points, lambda u: (u - away) @ H @ (u - away)
+    added = run.covariance_of_plateaus()
+    # The step is 1: (1 - 0.4)^2 - 0.4^2 = 0.2 of the quadratic.
+    np.testing.assert_allclose(added, np.diag([0.0, 0.0 if level else 0.25 / 0.2 - 0.25]), atol=1e-9)
 
 
 def test_a_plastic_body_is_no_elastic_one_and_is_pictured(tmp_path):
