@@ -34,7 +34,7 @@ def test_a_capture_without_photographs_is_refused(tmp_path):
 def test_a_click_and_a_rectangle_become_lines_of_the_settings(tmp_path):
     page_file = write_select_page(capture(tmp_path / "mug </script>"))
     with opened(page_file.as_uri(), 900, 700) as (page, complaints):
-        page.wait_for_function("document.getElementById('photo').naturalWidth == 400")
+        page.locator("#photo").evaluate("image => image.decode()")
         area = page.locator("#photo").bounding_box()
 
         def at(x, y):
@@ -53,7 +53,7 @@ def test_a_click_and_a_rectangle_become_lines_of_the_settings(tmp_path):
         page.select_option("#kind", "length")
         for name, ends in (("a b.jpg", [(10, 20), (390, 280)]), ("c.jpg", [(50, 60), (70, 80)])):
             page.select_option("#file", name)
-            page.wait_for_function("document.getElementById('photo').complete")
+            page.locator("#photo").evaluate("image => image.decode()")
             for end in ends:
                 page.mouse.click(*at(*end))
         ends = settings().length.ends
