@@ -14,6 +14,7 @@ CHANGES = overlay(
     scenes={"Pile": PILE | {"dt": 1e-3, "steps": 200}},
     experiments={"without": WITHOUT},
     identify={"refined_particles": 0},
+    advanced={"figures.pile": "without"},
 )
 
 
@@ -29,13 +30,14 @@ def test_bodies_are_scenes_that_are_identified_together(project):
         f"{RESULTS}/Pile/constants/metrics.json",
         f"{RESULTS}/Pile/true_law/metrics.json",
         f"{RESULTS}/experiments/without/constants/metrics.json",
+        f"{RESULTS}/figures/pile.png",
         *alone,
     )
     counts = {"render_static": 1, "ground_truth": 2, "gaussians_of_bodies": 1, "velocity_of_bodies": 1}
     counts |= {
         rule: 3 for rule in ("body_static", "body_truth", "body_gaussians", "mesh", "binding", "identify")
     }
-    counts |= {"identify_bodies": 1, "experiment_start": 2, "evaluate": 6}
+    counts |= {"identify_bodies": 1, "experiment_start": 2, "evaluate": 7, "pile": 1}
     assert {rule: plan[rule] for rule in counts} == counts and not plan["gaussians"]
     together = plan.one("identify_bodies")
     assert f"{DATA}/Pile/dynamic/transforms.json" in together.inputs
