@@ -1,19 +1,17 @@
-"""Kernels of points in closed surfaces, of nearest neighbours, and of the binding of Gaussians to particles."""
+"""Kernels of points in closed surfaces, and of nearest neighbours."""
 
 from __future__ import annotations
 
 import torch
 import trimesh
 
-from neuma_lib.coupling.particle_binding import bind
 from neuma_lib.geometry.nearest import nearest
 from neuma_lib.geometry.volume import inside
 
 
 def compile_kernels(device: torch.device) -> None:
-    """Whether a point is in a box, and the binding of a Gaussian to a particle, on the CPU whatever the device;
-    neighbours there and on it, for distances in double precision."""
-    bind(torch.zeros(1, 3), torch.eye(3)[None], torch.zeros(1, 3))
+    """Whether a point is in a box, computed on the CPU whatever the device; neighbours there and on it, for distances
+    in double precision."""
     inside(trimesh.creation.box(), trimesh.creation.box().centroid[None])
     for place in {torch.device("cpu"), device}:
         point = torch.zeros(1, 3, dtype=torch.float64, device=place)

@@ -3,7 +3,7 @@
 
 rule binding:
     input:
-        kernels=kernels("geometry"),
+        kernels=kernels("binding"),
         gaussians=of_replicate("gaussians.ply"),
         sampled=of_replicate("sampled_particles.h5"),
     output:

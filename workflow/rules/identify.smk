@@ -8,7 +8,7 @@ for views in ("", "+views={views}"):
             "identify_views" if views else "identify"
         input:
             **{name: of_each_video(of_replicate(file)) for name, file in BODY.items()},
-            kernels=kernels("geometry", "laws", "rendering"),
+            kernels=kernels("binding", "geometry", "laws", "rendering"),
             mesh=of_each_video(of_replicate("mesh.ply")),
             transforms=of_each_video(of_data("dynamic/transforms.json")),
             velocity=of_each_video(of_replicate("velocity.json")),

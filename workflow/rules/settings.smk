@@ -128,7 +128,7 @@ wildcard_constraints:
     scene=f"({'|'.join(SETTINGS.scenes) or 'none'})([+][^/]*)?",
     prior=f"({'|'.join(SETTINGS.priors.laws) or 'none'})([+]seed=[1-9][0-9]*)?",
     method=f"({'|'.join(SETTINGS.methods) or 'none'})([+][^/]*)?",
-    group="geometry|simulation|laws|rendering|radiance|springs",
+    group="binding|geometry|simulation|laws|rendering|radiance|springs",
     views="[0-9]+(,[0-9]+)*",
 
 
