@@ -27,8 +27,8 @@ _USED = re.compile(r"core seconds: ([\d.]+) to start, ([\d.]+) of work(?:; memor
 def timings_table(results: Path) -> str:
     """Markdown table with a row for each stage, the most expensive first, and their total.
 
-    Core seconds and memory come from the logs. Snakemake samples a job only now and then, misses up to 30 s of each,
-    and does not see the process that runs a script (`workflow.preloaded`).
+    Core seconds and memory come from the logs. Snakemake samples a job only now and then, and misses up to
+    30 s of each.
 
     Args:
         results: folder with the subfolders ``benchmarks`` and ``logs``.

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-GPUS = Path(__file__).parents[2] / "workflow" / "interpreter"
+GPUS = Path(__file__).parents[2] / "workflow" / "gpus"
 SCRIPT = "import os\nprint(os.environ.get('CUDA_VISIBLE_DEVICES'), flush=True)\ninput()\n"
 
 

@@ -18,7 +18,6 @@ from neuma_lib.project.project import remember_settings, remembered_settings
 from neuma_lib.errors import InputError
 from neuma_lib.mechanics.catalogue import DEFINED_IN
 from neuma_lib.methods.registry import methods
-from workflow import preloaded
 from workflow.defaults import complete, digest_of
 from workflow.provenance import code_digest
 from workflow.progress import show_one_line_a_job
@@ -63,12 +62,10 @@ EITHER_GPU = int(GPU and HAS_CUDA)
 # Scripts run in separate processes. They find the library, share one kernel cache, and use one thread each (two OpenMP
 # threads on a busy machine are far slower than one). NEUMA_GPUS is the number of GPUs to spread them over.
 THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
-INTERPRETER = ROOT / "workflow" / "interpreter"
+SPREAD = [str(ROOT / "workflow" / "gpus")] if os.environ.get("NEUMA_GPUS") else []
 os.environ.update(
     {
-        "PYTHONPATH": os.pathsep.join(
-            [str(INTERPRETER), str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
-        ),
+        "PYTHONPATH": os.pathsep.join([*SPREAD, str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]),
         "NEUMA_KERNEL_CACHE": str(Path(SETTINGS.kernel_cache).resolve()),
         **{name: os.environ.get(name, "1") for name in THREAD_LIMITS},
     }
@@ -91,8 +88,6 @@ onstart:
             ) from None
     for scene in {job.wildcards_dict.get("scene") for job in workflow.dag.needrun_jobs()} - {None}:
         checked(remember_settings)(RESULTS, scene, workflow.configfiles, ROOT)
-    if workflow.local_exec and not GPU:
-        preloaded.start()
 
 
 def names_of(scenes, replicates=True):

@@ -1,0 +1,39 @@
+"""Several GPUs for the jobs of one Snakemake: with NEUMA_GPUS=2 each script sees one of two, shared out evenly.
+
+Python runs this file before a script, and so before torch, Warp or Blender look for devices. Each GPU has as many
+places as are asked for, and a script takes the lowest that is free on any; they are locked files, which the system
+frees when a process ends, however it ends.
+"""
+
+import fcntl
+import os
+import platform
+import sys
+from itertools import count
+from pathlib import Path
+
+
+def claim_gpu(gpus: int) -> tuple[int, object]:
+    """The GPU with the lowest free place, and the open file that holds it: keep it for as long as it counts."""
+    # in the common temporary folder a name could be a link that another user made
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "neuma_lib" / platform.node()
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    for place in count():
+        for gpu in range(gpus):
+            flags = os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW
+            file = open(os.open(folder / f"gpu-{gpu}-{place}.lock", flags, 0o600), "w")
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                return gpu, file
+            except OSError:
+                file.close()
+
+
+# sys.argv is not there yet.
+if (
+    os.environ.get("NEUMA_GPUS", "").isdigit()
+    and "CUDA_VISIBLE_DEVICES" not in os.environ
+    and any(f"{os.sep}.snakemake{os.sep}scripts{os.sep}" in word for word in sys.orig_argv[:4])
+):
+    _gpu, _claim = claim_gpu(max(1, int(os.environ["NEUMA_GPUS"])))
+    os.environ["CUDA_VISIBLE_DEVICES"] = str(_gpu)
