@@ -149,8 +149,8 @@ def draw_starts(
         if len(starts) == count:
             return starts
     if not starts:
-        counted = ", ".join(f"{number} {REJECTIONS[reason]}" for reason, number in rejected.most_common())
-        problem = f"none of {len(draws)} experiments of the kind {kind} is possible inside the box: {counted}"
+        reasons = ", ".join(f"{number} {REJECTIONS[reason]}" for reason, number in rejected.most_common())
+        problem = f"none of {len(draws)} experiments of the kind {kind} is possible inside the box: {reasons}"
         raise InputError("next", problem, "Raise next.max_height or next.max_speed, or leave the kind out")
     return starts
 

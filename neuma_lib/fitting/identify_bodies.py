@@ -169,9 +169,8 @@ class _Search:
                 continue
             middle = max(0, self._last - 1)
             runs = []
-            for (
-                family
-            ) in own:  # from the fit before, and from guesses, since each may be near a local minimum
+            # From the fit before, and from guesses, since each may be near a local minimum.
+            for family in own:
                 groups = [family.with_guesses(self._of_body(k))], self._starts(family)
                 tried = [self._run(k, family, starts, middle) for starts in groups]
                 runs.append(min(tried, key=lambda run: (not run.alive, run.loss)))

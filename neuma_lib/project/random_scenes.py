@@ -244,8 +244,8 @@ def draw_scenes(
                 break
             rejected[reason] += 1
         else:
-            counted = ", ".join(f"{number} {REJECTIONS[reason]}" for reason, number in rejected.most_common())
-            problem = f"{ATTEMPTS} draws of a {shape} of the family {family} are unusable: {counted}"
+            reasons = ", ".join(f"{number} {REJECTIONS[reason]}" for reason, number in rejected.most_common())
+            problem = f"{ATTEMPTS} draws of a {shape} of the family {family} are unusable: {reasons}"
             raise InputError("random", problem, "Change the ranges")
         scene |= {"dt": dt, "steps": STEPS * max(1, round(scene.pop("duration") / dt / STEPS))}
         scene |= _contact_and_truth(settings, k)
