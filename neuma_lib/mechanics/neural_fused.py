@@ -1,6 +1,6 @@
 """Neural constitutive law as one CUDA kernel forward and one backward: features, network, stress.
 
-The reference in :mod:`neuma_lib.mechanics.neural` writes every activation to memory and launches a dozen kernels.
+The reference in :mod:`neuma_lib.mechanics.neural` writes every activation to memory and launches dozens of kernels.
 These kernels (``neural_fused.cu``) read only F, write only the result, and recompute activations in the backward pass.
 
 A warp owns one or two tiles of 16 rows. Each lane computes the features and the final output of one row, and the tensor
@@ -36,7 +36,7 @@ from neuma_lib.mechanics.fused_launch import (
     warp_device,
 )
 from neuma_lib.mechanics.law import Weights
-from neuma_lib.mechanics.neural_kernels import FEATURES, GRAM
+from neuma_lib.mechanics.neural_vector import FEATURES, GRAM
 from neuma_lib.mechanics.singular_values_kernels import SVD, SWEEPS
 
 ROWS = 128

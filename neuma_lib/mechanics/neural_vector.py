@@ -19,9 +19,11 @@ from neuma_lib.device import native_source
 from neuma_lib.mechanics.analytic_kernels import CPU_WIDTH
 from neuma_lib.mechanics.fused_launch import contiguous, launch_blocks
 from neuma_lib.mechanics.law import Weights
-from neuma_lib.mechanics.neural_kernels import FEATURES, GRAM
 from neuma_lib.mechanics.singular_values_kernels import END, FUSE, SVD, TYPES, filled, warp_types
 
+FEATURES = 13
+GRAM = native_source(__file__, ".h")["gram"]
+"""C++ source of F^T F and det F."""
 BLOCK = 64
 """Rows per block."""
 HIDDEN = 64
@@ -146,11 +148,6 @@ def _scratch(F: Tensor) -> Tensor:
     if F.dtype not in buffers:
         buffers[F.dtype] = F.new_empty(SCRATCH)
     return buffers[F.dtype]
-
-
-def supported(device: torch.device, dtype: torch.dtype) -> bool:
-    """Whether these kernels run: on a CPU."""
-    return device.type == "cpu" and dtype in RANGE
 
 
 def new_cache(F: Tensor) -> Tensor:
