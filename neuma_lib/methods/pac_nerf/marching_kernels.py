@@ -8,28 +8,57 @@ import torch
 import warp as wp
 
 from neuma_lib.device import start_warp
-from neuma_lib.methods.pac_nerf.lattice_kernels import lattice_functions, lattice_types
+from neuma_lib.methods.pac_nerf.lattice import Lattice
 
 start_warp()
 
 
 @functools.cache
+def warp_types(dtype: torch.dtype) -> SimpleNamespace:
+    """Warp's types for a torch precision, and the struct of a lattice."""
+    real = wp.dtype_from_torch(dtype)
+    types = SimpleNamespace(real=real, vec3=wp.types.vector(length=3, dtype=real))
+
+    @wp.struct
+    class Place:
+        origin: types.vec3  # position of node (0, 0, 0) [m]
+        inv_voxel: real  # [1/m]
+        nodes: wp.vec3i  # along each axis, the last index is contiguous
+
+    types.Place = Place
+    return types
+
+
+def place_of(lattice: Lattice, dtype: torch.dtype):
+    """A lattice as a struct for kernels."""
+    t = warp_types(dtype)
+    place = t.Place()
+    place.origin, place.inv_voxel = t.vec3(*lattice.origin), 1.0 / lattice.voxel
+    place.nodes = wp.vec3i(*lattice.nodes)
+    return place
+
+
+@functools.cache
 def kernels(dtype: torch.dtype) -> SimpleNamespace:
     """Kernels `march`, `composite` and `composite_adjoint` over rays."""
-    t, functions = lattice_types(dtype), lattice_functions(dtype)
+    t = warp_types(dtype)
     real, vec3, Place = t.real, t.vec3, t.Place
-    cell, within, share, row = functions.cell, functions.within, functions.share, functions.row
     module = wp.get_module(f"{__name__}.{str(dtype).removeprefix('torch.')}")
     kernel = functools.partial(wp.kernel, enable_backward=False, module=module)
 
     @wp.func(module=module)
     def density_at(place: Place, density: wp.array(dtype=real), x: vec3):
-        c = cell(place, x)
-        f = within(place, x, c)
+        """Trilinear interpolation."""
+        at = (x - place.origin) * place.inv_voxel
+        c = wp.vec3i()
+        for a in range(3):
+            c[a] = wp.clamp(wp.int32(wp.floor(at[a])), 0, place.nodes[a] - 2)
+        f = vec3(at[0] - real(c[0]), at[1] - real(c[1]), at[2] - real(c[2]))
         total = real(0.0)
         for i in range(2):
             for j in range(2):
-                n, w = row(place, c, i, j), share(f[0], i) * share(f[1], j)
+                n = ((c[0] + i) * place.nodes[1] + c[1] + j) * place.nodes[2] + c[2]
+                w = wp.where(i == 1, f[0], real(1.0) - f[0]) * wp.where(j == 1, f[1], real(1.0) - f[1])
                 total += w * ((real(1.0) - f[2]) * density[n] + f[2] * density[n + 1])
         return total
 
