@@ -12,12 +12,11 @@ from fractions import Fraction
 from functools import cache
 
 import torch
-import warp as wp
 from torch import Tensor
 
 from neuma_lib.device import native_source
 from neuma_lib.mechanics.analytic_kernels import CPU_WIDTH
-from neuma_lib.mechanics.fused_launch import contiguous, launch_blocks
+from neuma_lib.mechanics.fused_launch import addressed, contiguous, launch_blocks
 from neuma_lib.mechanics.law import Weights
 from neuma_lib.mechanics.singular_values_kernels import END, FUSE, SVD, TYPES, filled, warp_types
 
@@ -97,19 +96,13 @@ def source(backward: bool, dtype: torch.dtype) -> str:
 @cache
 def evaluate_kernel(dtype: torch.dtype):
     """Kernel (F, W0, W1, W2, elastic, scale, n, cache, out, work), launched by `launch_blocks`."""
-    real, _, _ = warp_types(dtype)
+    own = addressed(elastic=int, scale=warp_types(dtype)[0], n=int)
 
-    @wp.func_native(source(False, dtype))
-    def evaluate_rows(
-        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, elastic: int, scale: real, n: int, cache: wp.uint64,
-        out: wp.uint64, work: wp.uint64,
-    ): ...  # fmt: skip
+    @own.func_native(source(False, dtype))
+    def evaluate_rows(F, W0, W1, W2, elastic, scale, n, cache, out, work): ...
 
-    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
-    def neural_vector_evaluate(
-        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, elastic: int, scale: real, n: int, cache: wp.uint64,
-        out: wp.uint64, work: wp.uint64,
-    ):  # fmt: skip
+    @own.kernel("unique", grid_stride=False)
+    def neural_vector_evaluate(F, W0, W1, W2, elastic, scale, n, cache, out, work):
         evaluate_rows(F, W0, W1, W2, elastic, scale, n, cache, out, work)
 
     return neural_vector_evaluate
@@ -119,20 +112,14 @@ def evaluate_kernel(dtype: torch.dtype):
 def vjp_kernel(dtype: torch.dtype):
     """Kernel (F, W0, W1, W2, elastic, scale, n, cache, grad_out, grad_F, total0, total1, total2, work), launched by
     `launch_blocks`. It adds the gradients of the weights to the totals."""
-    real, _, _ = warp_types(dtype)
+    own = addressed(elastic=int, scale=warp_types(dtype)[0], n=int)
 
-    @wp.func_native(source(True, dtype))
-    def vjp_rows(
-        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, elastic: int, scale: real, n: int, cache: wp.uint64,
-        grad_out: wp.uint64, grad_F: wp.uint64, total0: wp.uint64, total1: wp.uint64, total2: wp.uint64,
-        work: wp.uint64,
-    ): ...  # fmt: skip
+    @own.func_native(source(True, dtype))
+    def vjp_rows(F, W0, W1, W2, elastic, scale, n, cache, grad_out, grad_F, total0, total1, total2, work): ...
 
-    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
+    @own.kernel("unique", grid_stride=False)
     def neural_vector_vjp(
-        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, elastic: int, scale: real, n: int, cache: wp.uint64,
-        grad_out: wp.uint64, grad_F: wp.uint64, total0: wp.uint64, total1: wp.uint64, total2: wp.uint64,
-        work: wp.uint64,
+        F, W0, W1, W2, elastic, scale, n, cache, grad_out, grad_F, total0, total1, total2, work,
     ):  # fmt: skip
         vjp_rows(F, W0, W1, W2, elastic, scale, n, cache, grad_out, grad_F, total0, total1, total2, work)
 

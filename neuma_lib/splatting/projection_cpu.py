@@ -7,7 +7,7 @@ import re
 import torch
 import warp as wp
 
-from neuma_lib.device import native_source, start_warp
+from neuma_lib.device import native_source, start_warp, typed
 from neuma_lib.splatting.records import SPLAT_SIZE
 from neuma_lib.splatting.spherical_harmonics import SH_C0, SH_C1, SH_C2, SH_C3
 
@@ -29,61 +29,47 @@ def source(dtype: torch.dtype, name: str, **constants: float) -> str:
 def kernels(dtype: torch.dtype, near: float, slack: float, unlimited: float, culled: float):
     """``(project, geometry_adjoint)`` Warp kernels of a dtype over packs of `LANES` Gaussians."""
     real = wp.dtype_from_torch(dtype)
-    module = wp.get_module(f"{__name__}.{str(dtype).removeprefix('torch.')}")
+    types = {
+        **dict.fromkeys(("pack", "count", "frames", "views", "coefficients"), int),
+        **dict.fromkeys(("width", "height", "eps2d", "alpha_min"), real),
+        "means": wp.array3d(dtype=real),  # (T, G, 3)
+        "covars": wp.array4d(dtype=real),  # (T, G, 3, 3)
+        "opacities": wp.array(dtype=real),  # (G,)
+        "sh": wp.array3d(dtype=real),  # (G, K, 3)
+        "viewmats": wp.array3d(dtype=real),  # (V, 4, 4)
+        "Ks": wp.array3d(dtype=real),  # (V, 3, 3)
+        "splats": wp.array3d(dtype=real),  # (T V, G, SPLAT_SIZE), out
+        "depths": wp.array2d(dtype=real),  # (T V, G), out
+        "grad_splats": wp.array3d(dtype=real),  # (T V, G, SPLAT_SIZE)
+        "grad_means": wp.array3d(dtype=real),  # (T, G, 3), out
+        "grad_covars": wp.array4d(dtype=real),  # (T, G, 3, 3), out
+    }
+    own = typed(types)
+    kernel = own.kernel(wp.get_module(f"{__name__}.{str(dtype).removeprefix('torch.')}"))
     constants = dict(NEAR_PLANE=near, REACH_SLACK=slack, UNLIMITED=unlimited, CULLED=culled)
 
-    @wp.func_native(source(dtype, "project", **constants))
+    @own.func_native(source(dtype, "project", **constants))
     def project_pack(
-        pack: int, count: int, frames: int, views: int, coefficients: int,
-        means: wp.array3d(dtype=real), covars: wp.array4d(dtype=real), opacities: wp.array(dtype=real),
-        sh: wp.array3d(dtype=real), viewmats: wp.array3d(dtype=real), Ks: wp.array3d(dtype=real),
-        width: real, height: real, eps2d: real, alpha_min: real,
-        splats: wp.array3d(dtype=real), depths: wp.array2d(dtype=real),
+        pack, count, frames, views, coefficients, means, covars, opacities, sh, viewmats, Ks, width, height, eps2d,
+        alpha_min, splats, depths,
     ): ...  # fmt: skip
 
-    @wp.func_native(source(dtype, "adjoint", **constants))
+    @own.func_native(source(dtype, "adjoint", **constants))
     def adjoint_pack(
-        pack: int, count: int, frames: int, views: int, coefficients: int,
-        means: wp.array3d(dtype=real), covars: wp.array4d(dtype=real), sh: wp.array3d(dtype=real),
-        viewmats: wp.array3d(dtype=real), Ks: wp.array3d(dtype=real), width: real, height: real,
-        splats: wp.array3d(dtype=real), depths: wp.array2d(dtype=real), grad_splats: wp.array3d(dtype=real),
-        grad_means: wp.array3d(dtype=real), grad_covars: wp.array4d(dtype=real),
+        pack, count, frames, views, coefficients, means, covars, sh, viewmats, Ks, width, height, splats, depths,
+        grad_splats, grad_means, grad_covars,
     ): ...  # fmt: skip
 
-    @wp.kernel(module=module, enable_backward=False)
-    def project(
-        means: wp.array3d(dtype=real),  # (T, G, 3)
-        covars: wp.array4d(dtype=real),  # (T, G, 3, 3)
-        opacities: wp.array(dtype=real),  # (G,)
-        sh: wp.array3d(dtype=real),  # (G, K, 3)
-        viewmats: wp.array3d(dtype=real),  # (V, 4, 4)
-        Ks: wp.array3d(dtype=real),  # (V, 3, 3)
-        width: real,
-        height: real,
-        eps2d: real,
-        alpha_min: real,
-        splats: wp.array3d(dtype=real),  # (T V, G, SPLAT_SIZE), out
-        depths: wp.array2d(dtype=real),  # (T V, G), out
-    ):
+    @kernel
+    def project(means, covars, opacities, sh, viewmats, Ks, width, height, eps2d, alpha_min, splats, depths):
         project_pack(
             wp.tid(), means.shape[1], means.shape[0], viewmats.shape[0], sh.shape[1], means, covars, opacities, sh,
             viewmats, Ks, width, height, eps2d, alpha_min, splats, depths,
         )  # fmt: skip
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel
     def geometry_adjoint(
-        means: wp.array3d(dtype=real),  # (T, G, 3)
-        covars: wp.array4d(dtype=real),  # (T, G, 3, 3)
-        sh: wp.array3d(dtype=real),  # (G, K, 3)
-        viewmats: wp.array3d(dtype=real),  # (V, 4, 4)
-        Ks: wp.array3d(dtype=real),  # (V, 3, 3)
-        width: real,
-        height: real,
-        splats: wp.array3d(dtype=real),  # (T V, G, SPLAT_SIZE)
-        depths: wp.array2d(dtype=real),  # (T V, G)
-        grad_splats: wp.array3d(dtype=real),  # (T V, G, SPLAT_SIZE)
-        grad_means: wp.array3d(dtype=real),  # (T, G, 3), out
-        grad_covars: wp.array4d(dtype=real),  # (T, G, 3, 3), out
+        means, covars, sh, viewmats, Ks, width, height, splats, depths, grad_splats, grad_means, grad_covars
     ):
         adjoint_pack(
             wp.tid(), means.shape[1], means.shape[0], viewmats.shape[0], sh.shape[1], means, covars, sh, viewmats, Ks,
