@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import torch
 import warp as wp
 
-from neuma_lib.device import start_warp
+from neuma_lib.device import start_warp, typed
 from neuma_lib.methods.pac_nerf.lattice import Lattice
 
 start_warp()
@@ -44,7 +44,19 @@ def kernels(dtype: torch.dtype) -> SimpleNamespace:
     t = warp_types(dtype)
     real, vec3, Place = t.real, t.vec3, t.Place
     module = wp.get_module(f"{__name__}.{str(dtype).removeprefix('torch.')}")
-    kernel = functools.partial(wp.kernel, enable_backward=False, module=module)
+    types = {
+        "place": Place,
+        **dict.fromkeys(("near", "step", "interval", "shift", "least", "end"), real),
+        "fill": wp.int32,
+        "density": wp.array(dtype=real),
+        "background": vec3,
+        **dict.fromkeys(("starts", "counts"), wp.array(dtype=wp.int32)),
+        "rays": wp.array(dtype=wp.int64),
+        **dict.fromkeys(("alphas", "reaching", "passed", "grad_passed", "grad_alphas"), wp.array(dtype=real)),
+        **dict.fromkeys("origins directions points colours pictures".split(), wp.array(dtype=vec3)),
+        **dict.fromkeys(("grad_pictures", "grad_colours"), wp.array(dtype=vec3)),
+    }
+    kernel = typed(types).kernel(module)
 
     @wp.func(module=module)
     def density_at(place: Place, density: wp.array(dtype=real), x: vec3):
@@ -71,22 +83,9 @@ def kernels(dtype: torch.dtype) -> SimpleNamespace:
 
     @kernel
     def march(
-        place: Place,
-        near: real,
-        step: real,
-        interval: real,
-        shift: real,
-        least: real,
-        end: real,
-        fill: wp.int32,
-        density: wp.array(dtype=real),
-        origins: wp.array(dtype=vec3),
-        directions: wp.array(dtype=vec3),
-        starts: wp.array(dtype=wp.int32),
-        points: wp.array(dtype=vec3),
-        rays: wp.array(dtype=wp.int64),
-        counts: wp.array(dtype=wp.int32),
-    ):
+        place, near, step, interval, shift, least, end, fill, density, origins, directions, starts, points, rays,
+        counts,
+    ):  # fmt: skip
         """Select points of a ray with a weight T alpha above `least`, until the transmittance T is below `end`.
 
         Counts the points, or writes them from `starts` on if `fill` is 1. Both passes select the same points.
@@ -119,15 +118,7 @@ def kernels(dtype: torch.dtype) -> SimpleNamespace:
             counts[r] = count
 
     @kernel
-    def composite(
-        background: vec3,
-        starts: wp.array(dtype=wp.int32),
-        alphas: wp.array(dtype=real),
-        colours: wp.array(dtype=vec3),
-        reaching: wp.array(dtype=real),
-        pictures: wp.array(dtype=vec3),
-        passed: wp.array(dtype=real),
-    ):
+    def composite(background, starts, alphas, colours, reaching, pictures, passed):
         """C = sum_i T_i alpha_i c_i + T background with T_i = prod_{j < i} (1 - alpha_j), stored in `reaching`."""
         r = wp.tid()
         transmitted = real(1.0)
@@ -141,15 +132,7 @@ def kernels(dtype: torch.dtype) -> SimpleNamespace:
 
     @kernel
     def composite_adjoint(
-        background: vec3,
-        starts: wp.array(dtype=wp.int32),
-        alphas: wp.array(dtype=real),
-        colours: wp.array(dtype=vec3),
-        reaching: wp.array(dtype=real),
-        grad_pictures: wp.array(dtype=vec3),
-        grad_passed: wp.array(dtype=real),
-        grad_alphas: wp.array(dtype=real),
-        grad_colours: wp.array(dtype=vec3),
+        background, starts, alphas, colours, reaching, grad_pictures, grad_passed, grad_alphas, grad_colours
     ):
         """Back to front, with the colour B and the transmittance P behind point i, which avoids division by 1 - alpha.
 
