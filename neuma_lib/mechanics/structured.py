@@ -202,6 +202,7 @@ class StructuredConstitutive(AdaptableConstitutive):
     native = True
     loops = True
     keeps_singular_values = True
+    shares_singular_values = True
     network_kernel: tuple[str, kernels.Constants]
     """Kind of the kernel, and the constants of the law."""
 
