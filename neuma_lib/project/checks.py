@@ -25,6 +25,7 @@ from neuma_lib.mechanics.catalogue import (
     PARTS,
     check_law,
     longitudinal_modulus,
+    stiffest,
     viscous_stiffness,
 )
 from neuma_lib.project.capture_scenes import checked_capture
@@ -282,7 +283,7 @@ def _courant_problem(
     modulus = longitudinal_modulus(law["elasticity"])
     if "viscosity" in law:
         modulus += viscous_stiffness(law["viscosity"])
-    number = math.sqrt(modulus / rho) * dt * grid
+    number = math.sqrt(stiffest(law.get("field")) * modulus / rho) * dt * grid
     if number > COURANT_LIMIT:
         yield (
             f"{where}: the Courant number {number:.3g} exceeds {COURANT_LIMIT} with dt = {dt:g} s and {grid} grid "
