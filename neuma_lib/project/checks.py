@@ -80,11 +80,11 @@ def lines(error: InputError) -> list[str]:
 
 def _laws(settings: Config) -> Iterator[tuple[str, dict[str, Any]]]:
     """All laws in the settings with their keys; of ranges the two ends."""
-    drawn = set(settings.random_scenes)
+    drawn = {*settings.random_scenes, *settings.random_piles}
     for name, scene in settings.scenes.items():
         if scene.law is not None and name not in drawn and not scene.part_of:
             yield f"scenes.{name}.law", scene.law.plain()
-        for key, body in scene.bodies.items():
+        for key, body in scene.bodies.items() if name not in drawn else ():
             yield f"scenes.{name}.bodies.{key}.law", body.law.plain()
     for name, law in settings.priors.laws.items():
         yield f"priors.laws.{name}", law.plain()
