@@ -1,5 +1,7 @@
 """Identification of a block whose stiffness changes along it, against candidates that are uniform."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -27,16 +29,16 @@ FAMILIES = {
 }
 
 
-def identified(field):
+def identified(field, E=4e4, velocity=VELOCITY, seed=5):
     """The block filmed with noise, identified from a uniform guess."""
-    body, truth = block(), law("hencky", E=4e4)
+    body, truth = block(), law("hencky", E=E)
     with torch.no_grad():
         own = analytic_law({**truth, **({"field": field} if field else {})}, MODEL.dt)
-        path = rollout(MODEL, own, body.state(VELOCITY), steps=FRAMES[-1], frames=FRAMES, total=True)
+        path = rollout(MODEL, own, body.state(velocity), steps=FRAMES[-1], frames=FRAMES, total=True)
         images = body.particle_gs(camera())(path.x, path.F_total)
-    noise = torch.randn(images.shape, generator=torch.Generator().manual_seed(5), dtype=images.dtype)
+    noise = torch.randn(images.shape, generator=torch.Generator().manual_seed(seed), dtype=images.dtype)
     centre = (body.mass @ body.x0 / body.mass.sum()).numpy()
-    motion = InitialMotion(np.array(VELOCITY), np.zeros(3), centre, np.eye(3), np.zeros(6))
+    motion = InitialMotion(np.array(velocity), np.zeros(3), centre, np.eye(3), np.zeros(6))
     families = {name: LawConfig(**spec) for name, spec in FAMILIES.items()}
     settings = IdentifyConfig(families=families, pyramid=(4, 8, 32), pose_tolerance=0.0)
     video = Observation(FRAMES, images + 0.01 * noise, camera())
@@ -76,3 +78,25 @@ def test_limits_of_families_with_fields():
     assert limits[0] == limits[1]
     steep = ramp.limited({**stiff, "ratio": 4.0}, MODEL, 1000.0)["E"]
     assert steep == pytest.approx(limits[0] / 4)
+
+
+@pytest.mark.slow
+def test_random_blocks():
+    """Of ten random blocks each: ends within 15 %, the boundary within 0.1, and uniform ones uniform in nine."""
+    draw, right = np.random.default_rng(0), {name: [] for name in FAMILIES}
+    for seed in range(10):
+        ratio = math.exp(draw.uniform(math.log(1.8), math.log(5)) * (-1) ** seed)
+        E = min(math.exp(draw.uniform(math.log(4e4), math.log(1e5))), 1e5 / max(ratio, 1))
+        velocity, boundary = (draw.uniform(-0.8, 0.8), draw.uniform(-2, -1), 0.0), draw.uniform(0.3, 0.7)
+        fields = {"ramp": {"ratio": ratio}, "halves": {"ratio": ratio, "boundary": boundary}}
+        for name in FAMILIES:
+            field = {"name": name, **fields[name]} if name in fields else None
+            best = identified(field, E, velocity, seed).best
+            ends = [E, E * ratio] if field else [E]
+            fitted = [best.values["E"] * share for share in (1.0, best.values.get("ratio", 1.0))]
+            close = all(abs(own / end - 1) < 0.15 for own, end in zip(fitted, ends, strict=False))
+            placed = name != "halves" or abs(best.values.get("boundary", 0.0) - boundary) < 0.1
+            right[name].append(best.family.name == name and close and placed)
+    assert {name: sum(met) for name, met in right.items()} == pytest.approx(
+        dict.fromkeys(FAMILIES, 10), abs=1
+    )
