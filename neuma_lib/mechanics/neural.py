@@ -46,6 +46,8 @@ class NeuralConstitutive(AdaptableConstitutive):
     kind: str
     scale: float
     native = True
+    keeps_singular_values = True
+    loops = True
 
     @property
     def capturable(self) -> bool:
@@ -84,8 +86,14 @@ class NeuralConstitutive(AdaptableConstitutive):
     def evaluate_with_cache(self, F, weights, out=None, cache=None):
         if F.device.type != "cpu":
             return self.evaluate(F, weights, out), None
-        cache = neural_vector.new_cache(F) if cache is None else cache
+        cache = F.new_empty(self.cache_shape(F, weights)) if cache is None else cache
         return neural_vector.evaluate(F, weights, self.kind, self.scale, out, cache), cache
+
+    def kernel(self, F, weights, backward):
+        return neural_vector.kernel_of(self.kind, self.scale, F, weights, backward)
+
+    def cache_shape(self, F, weights):
+        return neural_vector.cache_shape(F)
 
     def accumulators(self, F, grad_weights):
         return (neural_fused.partial_sums(F),) if _kernels(F) is neural_fused else grad_weights
