@@ -134,11 +134,11 @@ def angular_momentum(model, mass, x, v, C):
 
 
 def loss_of(path):
-    """A random linear function of the states of a path."""
+    """A random linear function of the states of a path, the same in all precisions."""
     generator = torch.Generator().manual_seed(0)
     values = [10 * path.x, path.v, path.F, 0.1 * path.C, path.F_total]
     return sum(
-        (torch.randn(value.shape, generator=generator, dtype=value.dtype).to(value.device) * value).sum()
+        (torch.randn(value.shape, generator=generator, dtype=torch.float64).to(value.device) * value).sum()
         for value in values
         if value is not None
     )
