@@ -17,7 +17,7 @@ from neuma_lib.sim.state import State
 from tests.support.contact_scenes import lattice
 from tests.support.errors import refused
 from tests.support.gradients import check_small_differences
-from tests.support.sim_scenes import DENSITY, DT, cube, linear_momentum, make_law
+from tests.support.sim_scenes import DENSITY, DT, cube, linear_momentum, loss_of, make_law
 
 pytestmark = pytest.mark.core
 
@@ -36,14 +36,6 @@ def pile(count=2):
         velocity, spin = (0.5 - k, speeds[k], 0.1 * k), (1.0 + k, 2.0 - 3 * k, 3.0)
         states.append(State.rigid(x, (1 + k) * mass, vol0, velocity, spin))
     return State.joined(states, separate=True), consecutive(list(map(make_law, LAWS[:count])), SIZES[:count])
-
-
-def loss_of(path):
-    generator = torch.Generator().manual_seed(0)
-    values = [10 * path.x, path.v, path.F, 0.1 * path.C]
-    return sum(
-        (torch.randn(value.shape, generator=generator, dtype=torch.float64) * value).sum() for value in values
-    )
 
 
 def gradients(model, law, start, **options):

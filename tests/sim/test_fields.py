@@ -13,7 +13,7 @@ from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.settle import settle
 from neuma_lib.sim.state import State
 from tests.support.errors import refused
-from tests.support.sim_scenes import DT, SPECS, cube, prism, strained
+from tests.support.sim_scenes import DT, SPECS, cube, loss_of, prism, strained
 
 pytestmark = pytest.mark.core
 
@@ -32,12 +32,6 @@ def scene():
     x = x[x[:, 0].argsort()]
     v, F, C = strained(x, size=0.02)
     return State(x, v, mass, vol0, F, C)
-
-
-def loss_of(path):
-    generator = torch.Generator().manual_seed(0)
-    values = 10 * path.x, path.v, path.F, 0.1 * path.C
-    return sum((torch.randn(v.shape, generator=generator, dtype=v.dtype) * v).sum() for v in values)
 
 
 @pytest.mark.parametrize("name", ["neo_hookean", "von_mises"])
