@@ -82,7 +82,7 @@ def test_exposure_is_found_exactly_and_outside_what_moves():
 
 
 def exposure_of_each_pixel(seen, empty):
-    """The slow twin of `match_exposure` for one channel: each pixel is a value of its own."""
+    """The slow twin of `match_exposure` for one channel: without counts of equal levels."""
     seen, empty = seen.ravel().astype(float), empty.ravel().astype(float)
     valid = (seen > 4) & (seen < 251) & (empty > 4) & (empty < 251)
     seen, empty = seen[valid], empty[valid]
