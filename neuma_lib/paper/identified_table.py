@@ -125,11 +125,12 @@ def identified_table(scenes: Sequence[Mapping[str, Any]]) -> tuple[str, str]:
     return as_csv([["scene", "family", "family_is", "constants", *COLUMNS], *rows]), "\n".join(text)
 
 
-def _kind(spec: Mapping[str, Mapping[str, Any]]) -> tuple[str, str, bool]:
-    """Names of both parts, and whether a viscous flow has a yield stress."""
+def _kind(spec: Mapping[str, Mapping[str, Any]]) -> tuple[str, str, bool, str]:
+    """Names of elasticity and plasticity, whether a viscous flow has a yield stress, and the name of a viscous part."""
     plasticity = spec.get("plasticity") or {"name": "identity"}
     yields = plasticity["name"] == "viscous_flow" and plasticity.get("yield_stress", 0) > 0
-    return spec["elasticity"]["name"], plasticity["name"], yields
+    viscosity = (spec.get("viscosity") or {"name": ""})["name"]
+    return spec["elasticity"]["name"], plasticity["name"], yields, viscosity
 
 
 def _listed(quantities: Sequence[Mapping], determined: bool) -> str:

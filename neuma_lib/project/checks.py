@@ -96,8 +96,8 @@ def _laws(settings: Config) -> Iterator[tuple[str, dict[str, Any]]]:
     for group in ("families", "outside"):
         for name, family in getattr(settings.random, group).items():
             for end in (0, 1):
-                parts = {"elasticity": family.elasticity, "plasticity": family.plasticity}
-                yield f"random.{group}.{name}", {key: part.at(end) for key, part in parts.items()}
+                parts = {key: getattr(family, key) for key in PARTS}
+                yield f"random.{group}.{name}", {key: part.at(end) for key, part in parts.items() if part}
 
 
 def _checked(where: str, spec: Mapping[str, Any], dt: float = 1.0) -> tuple[dict[str, Any] | None, list[str]]:
