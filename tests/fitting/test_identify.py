@@ -107,6 +107,17 @@ def test_constants_and_family_of_the_truth_are_identified():
     assert identified.as_dict()["law"]["plasticity"] == {"name": "identity"}
 
 
+def test_a_viscous_part_is_identified():
+    """Among an elastic solid and a fluid. The damping of the simulation is in the truth and in the fit."""
+    truth = {"elasticity": {"name": "hencky", "E": 1.5e4, "nu": 0.35}}
+    truth["viscosity"] = {"name": "kelvin_voigt", "viscosity": 60.0}
+    damped = {"elasticity": ELASTIC["elasticity"], "viscosity": {"name": "kelvin_voigt", "viscosity": 20.0}}
+    identified = identified_in(truth, {"fluid": FLUID, "hencky": ELASTIC, "damped": damped})
+    assert identified.best.family.name == "damped" and identified.ties == []
+    assert identified.best.values["E"] == pytest.approx(1.5e4, rel=0.05)
+    assert identified.best.values["viscosity"] == pytest.approx(60.0, rel=0.1)
+
+
 def test_held_out_frames_select_the_family():
     """The first frames are of one family, and fit it better. The last frames are those that the fit of the other one
     predicts, which is therefore selected. Fits to the first frames do not depend on the last ones."""
