@@ -212,11 +212,8 @@ def fit_swing(
         fitted: of `RATIO` and `RETARDATION`. A body whose retardation has not been fitted is elastic.
         before: another fit of the same pictures, from which this one starts.
     """
-    body, prior, first = (
-        swing.resting,
-        (placement, placement_std),
-        FIRST_RETARDATION * (RETARDATION in fitted),
-    )
+    body, prior = swing.resting, (placement, placement_std)
+    first = FIRST_RETARDATION * (RETARDATION in fitted)
 
     def joint(pose: Array, found: Array, shape: Sequence[float], centre: tuple[float, float]):
         """All pictures, and unknowns with a placement."""
