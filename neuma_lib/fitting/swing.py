@@ -55,8 +55,8 @@ FIRST_RELEASES = (0.0, 0.03, 0.06)
 """Times of release after the first photograph before the fit [s], of which the best is the start."""
 FIRST_RETARDATION = 5e-3
 """Retardation time before it is fitted [s]."""
-FITS = {"predicted": (), "fitted": (RATIO,), "damped": (RATIO, RETARDATION)}
-"""Results of a swing, and the numbers of the shape that each fits in addition to share and release."""
+FITS = {"predicted": (), "fitted": (RATIO,)}
+"""Results of a swing on each grid, and the numbers of the shape that each fits in addition to share and release."""
 _NEIGHBOURS = 40  # particles whose affine motion a point of the surface follows
 _DIFFERENCES = {RATIO: 0.02, HELD: 0.02, RETARDATION: 0.2}  # of logarithms, and of the share
 _VIBRATION = 4.0  # simulated time for the damping, in durations of the swing
@@ -292,42 +292,55 @@ def swing_record(
 
     Returns:
         Plain values: ``clamps``, name -> ``hang``, mu / rho, ``grids``, a list of ``cell`` and the results of `FITS`,
-        see `SwingFit.as_dict`, and ``silhouettes``, those of the prediction on the last grid [px]. The viscous body has
-        ``vibration``, and the same ``without_viscosity``. ``ratio``, mu / rho of the elastic body, is extrapolated from
-        the last two grids. Its ``log_std`` combines ``noise_std`` and ``grid_std``, the step of the extrapolation, and
-        over all clamps ``clamp_std``.
+        see `SwingFit.as_dict`, ``damped``, the result with a retardation time on the first grid, with its ``vibration``
+        and the same ``without_viscosity``, and ``silhouettes``, those of the prediction on the last grid [px].
+        ``ratio``, mu / rho of the elastic body, is extrapolated from the last two grids. Its ``log_std`` combines
+        ``noise_std`` and ``grid_std``, the step of the extrapolation, and over all clamps ``clamp_std``.
     """
-    clamps, done, total = {}, 0, len(FITS) * len(ratios) * len(cells)
+    clamps, done, total = {}, 0, (len(FITS) * len(cells) + 1) * len(ratios)
     duration = max(frames) - min(0.0, *FIRST_RELEASES) + 0.02
     pictures = held, list(frames.values()), list(frames)
     prior = poses, np.array(settings.placement), settings.placement_std
+
+    def fit(motion: Swing, ratio: float, fitted: Sequence[int], before: SwingFit | None) -> SwingFit:
+        nonlocal done
+        result = fit_swing(*pictures, motion, *prior, ratio, fitted, before)
+        done += 1
+        if progress:
+            progress(done, total)
+        return result
+
     for name, ratio in ratios.items():
         body = resting_body(mesh, settings, settings.clamps[name], size, swing.held)
-        grids: list[dict[str, Any]] = []
-        fits: dict[str, SwingFit] = {}
-        for dx in cells:
-            motion, last = Swing(body, resting_law(settings.nu), dx, duration), None
+        motions = [Swing(body, resting_law(settings.nu), dx, duration) for dx in cells]
+        grids: list[dict[str, SwingFit]] = []
+        for motion in motions:
+            own: dict[str, SwingFit] = {}
             for key, fitted in FITS.items():
-                last = fit_swing(*pictures, motion, *prior, ratio, fitted, fits.get(key, last))
-                fits[key] = last
-                done += 1
-                if progress:
-                    progress(done, total)
-            own = {key: fit.as_dict() for key, fit in fits.items()}
-            shape = fits["damped"].held.shape
-            own["damped"]["vibration"] = asdict(vibration(motion, shape))
-            own["damped"]["without_viscosity"] = asdict(vibration(motion, (*shape[:3], 0.0)))
-            grids.append({"cell": dx, **own})
-        silhouettes = [
-            [line.round(1).tolist() for line in contours(frame.predicted)]
-            for frame in fits["predicted"].frames
+                before = grids[-1][key] if grids else own.get("predicted")
+                own[key] = fit(motion, ratio, fitted, before)
+            grids.append(own)
+        damped = fit(motions[0], ratio, (RATIO, RETARDATION), grids[0]["fitted"])
+        shape = damped.held.shape
+        vibrations = {"vibration": shape, "without_viscosity": (*shape[:3], 0.0)}
+        silhouettes = [contours(frame.predicted) for frame in grids[-1]["predicted"].frames]
+        results = [
+            {"cell": dx, **{key: each.as_dict() for key, each in own.items()}}
+            for dx, own in zip(cells, grids, strict=True)
         ]
-        clamps[name] = {"hang": ratio, "grids": grids, "silhouettes": silhouettes, **_over_grids(grids)}
+        clamps[name] = {
+            "hang": ratio,
+            "grids": results,
+            "damped": damped.as_dict()
+            | {key: asdict(vibration(motions[0], own)) for key, own in vibrations.items()},
+            "silhouettes": [[line.round(1).tolist() for line in lines] for lines in silhouettes],
+            **over_grids(results),
+        }
     return {"times": list(frames), "clamps": clamps, **over_clamps(clamps)}
 
 
-def _over_grids(grids: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """mu / rho of the elastic body from the last two grids, see `swing_record`."""
+def over_grids(grids: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """mu / rho of the elastic body from the last two of ``grids``, see `swing_record`."""
     log, noise = math.log(grids[-1]["fitted"]["ratio"]), grids[-1]["fitted"]["log_std"]
     step = 0.0
     if len(grids) > 1:

@@ -5,7 +5,7 @@ import pytest
 
 from neuma_lib.config.stills import RestingBodyConfig, StillsConfig, SwingConfig
 from neuma_lib.fitting.resting import HELD, RATIO, RELEASE, RETARDATION
-from neuma_lib.fitting.swing import Swing, SwingingBody, fit_swing, swing_record, vibration
+from neuma_lib.fitting.swing import Swing, SwingingBody, fit_swing, over_grids, swing_record, vibration
 from neuma_lib.io.datasets.stills import read_stills, read_swing
 from neuma_lib.sim.equilibrium import extrapolated
 from tests.fitting.test_resting_records import BODY
@@ -98,26 +98,28 @@ def test_files_of_a_swing(tmp_path):
 
 
 def test_a_record_of_a_swing_has_all_results():
-    """With one frame on coarse grids, for its keys. The outline is that of the prediction."""
+    """With one frame on a coarse grid, for its keys. The outline is that of the prediction."""
     held, frames = twin(0.015, TIMES[2:3])
     settings = RestingBodyConfig(
         **BODY | {"clamps": {"7 cm": BODY["clamps"]["7 cm"]}, "unit": 1.0, "nu": 0.45}
     )
     region = {"lowest": beam.HELD[0].tolist(), "highest": beam.HELD[1].tolist()}
     own = SwingConfig(body="beam", still="twin", silhouettes="swing", held=region)
-    cells = 0.02, 0.015
     result = swing_record(
-        beam.dumbbell(), settings, own, held, frames, [beam.POSE], {"7 cm": RATIO_OF_TWIN}, 0.03, cells
+        beam.dumbbell(), settings, own, held, frames, [beam.POSE], {"7 cm": RATIO_OF_TWIN}, 0.03, (0.015,)
     )
     clamp = result["clamps"]["7 cm"]
-    grid = clamp["grids"][1]
+    (grid,) = clamp["grids"]
     assert clamp["hang"] == RATIO_OF_TWIN == pytest.approx(grid["predicted"]["ratio"])
     assert grid["predicted"]["contour_rms"] < 1 and len(grid["fitted"]["contour_rms_by_frame"]) == 1
     assert 0.005 < grid["predicted"]["sag"] < 0.02 and grid["fitted"]["retardation"] == 0
-    assert grid["damped"]["vibration"]["damping"] > grid["damped"]["without_viscosity"]["damping"] > 0
-    ratios = [each["fitted"]["ratio"] for each in clamp["grids"]]
-    assert result["ratio"] == clamp["ratio"] == pytest.approx(extrapolated(*ratios, 4 / 3), rel=0.01)
-    assert clamp["log_std"] == pytest.approx(np.hypot(clamp["noise_std"], clamp["grid_std"]))
+    assert clamp["damped"]["vibration"]["damping"] > clamp["damped"]["without_viscosity"]["damping"] > 0
+    assert result["ratio"] == pytest.approx(clamp["ratio"]) == pytest.approx(grid["fitted"]["ratio"])
+    assert clamp["log_std"] == clamp["noise_std"] > clamp["grid_std"] == 0
+    twice = [{"cell": cell, "fitted": {"ratio": r, "log_std": 0.03}} for cell, r in ((0.02, 80), (0.01, 90))]
+    both = over_grids(twice)
+    assert both["ratio"] == pytest.approx(extrapolated(80, 90, 2.0), rel=0.01)
+    assert both["log_std"] == pytest.approx(np.hypot(0.03, np.log(both["ratio"] / 90)))
     line = np.array(max(clamp["silhouettes"][0], key=len))
     assert line[:, 0].min() < np.nonzero(frames[TIMES[2]].mask.any(0))[0][0] + 2
     with pytest.raises(ValueError, match=r"swings\.a\.body"):
