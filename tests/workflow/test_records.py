@@ -1,4 +1,4 @@
-"""The patches of Snakemake's records, against the installed Snakemake."""
+"""The patches of Snakemake, against the installed one."""
 
 import shutil
 import subprocess
@@ -45,6 +45,23 @@ rule law:
     shell: "echo 1 > {{output}}"
 """
 
+MANY = """
+import sys
+sys.path.insert(0, {root!r})
+from workflow.records import start_local_jobs_at_once
+
+onstart:
+    if {patched}:
+        start_local_jobs_at_once(workflow)
+
+rule all:
+    input: expand("{{number}}.txt", number=range(16))
+
+rule one:
+    output: "{{number}}.txt"
+    shell: "sleep 2 && touch {{output}}"
+"""
+
 
 @pytest.mark.parametrize("patched", [True, False])
 def test_a_failed_job_counts_as_out_of_date(tmp_path, patched):
@@ -82,3 +99,15 @@ def test_a_deleted_folder_is_made_again_for_a_table(tmp_path, patched):
     shutil.rmtree(folder)
     assert run() != patched and (folder / "law.txt").exists() == patched
     assert run()
+
+
+@pytest.mark.parametrize("patched", [True, False])
+def test_jobs_are_selected_when_one_ends_and_not_all_the_time(tmp_path, patched):
+    """Without the patch they are selected more often the more jobs have ended."""
+    (tmp_path / "Snakefile").write_text(MANY.format(root=str(ROOT), patched=patched))
+    command = [sys.executable, "-m", "snakemake", "--cores", "4", "--scheduler", "greedy", "--verbose"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    selections = (done.stdout + done.stderr).count("Ready jobs:")
+    ends = 17
+    assert 4 <= selections <= ends if patched else selections > ends

@@ -21,7 +21,11 @@ from neuma_lib.methods.registry import methods
 from workflow.defaults import complete, digest_of
 from workflow.provenance import code_digest
 from workflow.progress import show_one_line_a_job
-from workflow.records import keep_records_of_failed_jobs, remake_deleted_folders
+from workflow.records import (
+    keep_records_of_failed_jobs,
+    remake_deleted_folders,
+    start_local_jobs_at_once,
+)
 from workflow.unlock import others
 from workflow.targets import refuse_unknown, requested_targets
 
@@ -75,6 +79,7 @@ os.environ.update(
 # Runs when all jobs are known and none has started, and not in a dry run. A cluster's nodes are not this machine.
 onstart:
     keep_records_of_failed_jobs(workflow.persistence)
+    start_local_jobs_at_once(workflow)
     rules = sorted({job.rule.name for job in workflow.dag.needrun_jobs() if job.resources.get("gpu")})
     if SETTINGS.device == "cuda" and rules and workflow.local_exec:
         from neuma_lib.device import choose_device
