@@ -107,15 +107,21 @@ def test_constants_and_family_of_the_truth_are_identified():
     assert identified.as_dict()["law"]["plasticity"] == {"name": "identity"}
 
 
-def test_a_viscous_part_is_identified():
-    """Among an elastic solid and a fluid. The damping of the simulation is in the truth and in the fit."""
-    truth = {"elasticity": {"name": "hencky", "E": 1.5e4, "nu": 0.35}}
-    truth["viscosity"] = {"name": "kelvin_voigt", "viscosity": 60.0}
-    damped = {"elasticity": ELASTIC["elasticity"], "viscosity": {"name": "kelvin_voigt", "viscosity": 20.0}}
-    identified = identified_in(truth, {"fluid": FLUID, "hencky": ELASTIC, "damped": damped})
-    assert identified.best.family.name == "damped" and identified.ties == []
-    assert identified.best.values["E"] == pytest.approx(1.5e4, rel=0.05)
-    assert identified.best.values["viscosity"] == pytest.approx(60.0, rel=0.1)
+@pytest.mark.parametrize("true", ["kelvin_voigt", "maxwell"])
+def test_a_viscous_part_is_identified(true):
+    """With its constants, among an elastic solid, a fluid and the other viscous part."""
+    constants = {
+        "kelvin_voigt": ({"viscosity": 60.0}, {"viscosity": 20.0}),
+        "maxwell": ({"modulus": 1e4, "relaxation": 0.02}, {"modulus": 5e3, "relaxation": 0.05}),
+    }
+    families = {"hencky": ELASTIC, "fluid": FLUID}
+    for name, (_, guess) in constants.items():
+        families[name] = {"elasticity": ELASTIC["elasticity"], "viscosity": {"name": name, **guess}}
+    truth, own = {"elasticity": {"name": "hencky", "E": 1.5e4, "nu": 0.35}}, constants[true][0]
+    identified = identified_in(truth | {"viscosity": {"name": true, **own}}, families)
+    assert identified.best.family.name == true and identified.ties == []
+    expected = {"E": 1.5e4, "nu": 0.35, **own}
+    assert identified.best.values == pytest.approx(expected, rel=0.03)
 
 
 def test_held_out_frames_select_the_family():
