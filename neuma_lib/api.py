@@ -336,7 +336,10 @@ def adapt(law: Law, scene: Scene, options: Mapping[str, Any] | None = None) -> A
     if isinstance(law, StructuredLaw):
         corrected = copy.deepcopy(law)
     else:
-        spec = {**specification(law.elasticity, law.plasticity, law.viscosity), "form": settings.form}
+        spec = {
+            **specification(law.elasticity, law.plasticity, law.viscosity, law.field),
+            "form": settings.form,
+        }
         corrected = structured_law(spec, scene.mpm.dt, seed=settings.seed)
     corrected.attach_adaptor(settings.rank, settings.alpha, settings.seed)
     problem = _start_and_loss(scene, settings)

@@ -19,10 +19,16 @@ class LawPart(Section):
 
 
 class LawConfig(Section):
-    """An analytic material: elastic law, return map and viscous part."""
+    """An analytic material: elastic law, return map, viscous part and changes along the body."""
 
     elasticity: LawPart = Field(description="elastic law and its constants, for example E [Pa] and nu")
     plasticity: LawPart = Field(LawPart(name="identity"), description="return map and its constants")
+    field: LawPart | None = Field(
+        None,
+        description="factor on all stresses along the body: `ramp` to `ratio` times those of the first end, or "
+        "`halves` with that ratio behind a `boundary`, a share of the length; in direction x, or of "
+        "`azimuth` and `elevation` [degrees]",
+    )
     viscosity: LawPart | None = Field(
         None,
         description="viscous part in shear and its constants: `kelvin_voigt` with viscosity [Pa s], or `maxwell` with "
@@ -31,5 +37,5 @@ class LawConfig(Section):
 
     @model_serializer(mode="wrap")
     def _without_missing_parts(self, serialise: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """A law without a viscous part has no such key, as in files that were written before there was one."""
+        """A law without an optional part has no such key, as in files that were written before there was one."""
         return {key: value for key, value in serialise(self).items() if value is not None}

@@ -65,7 +65,7 @@ def law_for_engine(
         problem = f"{engine} has no {'structured laws' if isinstance(law, StructuredLaw) else 'networks'}"
         raise InputError(f"law {law.name}", problem, "Fit the nearest law that it has with --fit")
     else:
-        spec = specification(law.elasticity, law.plasticity, law.viscosity)
+        spec = specification(law.elasticity, law.plasticity, law.viscosity, law.field)
     scale = known.get("scale") or 1.0
     if scale != 1.0 and not world:
         problem = f"a metre of its simulator is {1 / scale:.4g} m of the filmed world, which has other moduli"

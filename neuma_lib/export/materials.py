@@ -66,9 +66,9 @@ def engine_material(
     check_engine(engine)
     density, substep = _positive("density", density, "kg/m^3"), _positive("substep", substep, "s")
     parts = complete(spec, substep)
-    if viscosity := parts.pop("viscosity", None):
-        problem = f"{engine} has no such material: its solids have no {viscosity['name']}"
-        raise InputError("viscosity", problem, "Export the law without its viscous part")
+    for part in parts.keys() - {"elasticity", "plasticity"}:
+        problem = f"{engine} has no such material: its solids have no {parts[part]['name']}"
+        raise InputError(part, problem, "Export the law without this part")
     names = (parts["elasticity"]["name"], parts["plasticity"]["name"])
     elastic, plastic = (
         check_constants(part, known[values["name"]], {k: v for k, v in values.items() if k != "name"})

@@ -25,7 +25,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from neuma_lib.errors import InputError
@@ -108,6 +107,8 @@ def sample_unvisited(
     Returns:
         Symmetric deformation gradients (count, 3, 3) and weights in [0, 1], shape (count,), both like ``visited``.
     """
+    from scipy.spatial import cKDTree  # here, because the import takes an eighth of a second
+
     generator = torch.Generator().manual_seed(seed)
     visited_e, visited_V = _log_stretches(visited[:: -(-len(visited) // _MAX_VISITED)])
     size = visited_e.norm(dim=1).quantile(0.99).clamp(max=MAX_SIZE / REACH)

@@ -85,9 +85,10 @@ class Family:
 
     def contains(self, other: Family) -> bool:
         """Whether the other family, with fewer constants, is a limit of this one."""
-        flows = self.return_map in ("von_mises", "viscous_flow") or self._viscous
+        more = self.return_map in ("von_mises", "viscous_flow") or self._viscous or self.field
         same = self.spec["elasticity"]["name"] == other.spec["elasticity"]["name"]
-        return flows and same and set(other.constants) < set(self.constants)
+        same = same and other.field in (None, self.field)
+        return bool(more) and same and set(other.constants) < set(self.constants)
 
     def unbounded(self, values: Values) -> np.ndarray:
         """Unbounded constants (k,): logarithms, or logits of constants with two bounds."""
@@ -150,21 +151,29 @@ class Family:
         return (self.spec.get("plasticity") or {"name": "identity"})["name"]
 
     @property
+    def field(self) -> str | None:
+        """Name of its field, None if it is uniform."""
+        return (self.spec.get("field") or {"name": None})["name"]
+
+    @property
     def flows(self) -> bool:
         """Whether it has constants that limit plastic flow."""
         return bool(self._flow)
 
     def with_other_limits(self, values: Values, powers: Sequence[int]) -> list[Values]:
-        """Values with constants of plastic flow times 4 to each power (in logarithms or logits); none if elastic."""
-        flow = np.array([key in self._flow for key in self.constants])
+        """Values with constants of plastic flow, or of a body without flow the ratio of its field, times 4 to each
+        power (in logarithms or logits); none of a uniform elastic body."""
+        varied = np.array([key in (self._flow or ("ratio",)) for key in self.constants])
         u = self.unbounded(values)
-        return [self.bounded(u + math.log(4) * n * flow) for n in powers] if self.flows else []
+        return [self.bounded(u + math.log(4) * n * varied) for n in powers] if varied.any() else []
 
     @property
     def _flow(self) -> tuple[str, ...]:
         """Constants that limit plastic flow: those of the plasticity and, as E and nu, others of the elasticity."""
         return tuple(
-            key for key in self.constants if key not in _NO_FLOW and self._constants[key][0] != "viscosity"
+            key
+            for key in self.constants
+            if key not in _NO_FLOW and self._constants[key][0] not in ("viscosity", "field")
         )
 
     @property

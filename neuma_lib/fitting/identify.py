@@ -283,6 +283,7 @@ def _first_fit(
     than any flow before its fit, but it is a local minimum because it never yields. One fit therefore starts from
     guesses with weaker limits of the flow. The other starts from the fits of other families, also nearer to their
     elastic limit, if that is better than the result of the first. Redundant fits are used only if there is no other.
+    The first fit of an elastic body with a field starts from the best uniform one with other ratios.
     """
     guesses = [family.with_guesses(values) for values in ({}, published_values)]
     if settings.start_from_first_video and len(videos) > 1:
@@ -296,6 +297,8 @@ def _first_fit(
     if family.flows and fitted:
         flowing = [*guesses, *family.with_other_limits(guesses[-1], (-1, -2))]
         groups = [flowing, [*fitted, *family.with_other_limits(fitted[0], (1, 2))]]
+    elif family.field and fitted:
+        groups = [family.with_other_limits(fitted[0], (-1, 1)), groups[0]]
     fits = [FamilyRun(family, videos, [video.fitted for video in videos], settings) for _ in groups]
     lowest = math.inf
     for run, starts in zip(fits, groups, strict=True):

@@ -28,7 +28,7 @@ from neuma_lib.fitting.frame_batches import first_contact, frame_batches, held_o
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.batch import rollout_batch
-from neuma_lib.sim.model import MPM
+from neuma_lib.sim.model import MPM, consecutive, with_fields
 from neuma_lib.sim.rigid_flight import is_rigid, rigid_flight
 from neuma_lib.sim.state import State, Trajectory
 from neuma_lib.splatting.observation import Observation, joint_frames, rendered_steps, several
@@ -248,9 +248,9 @@ class VideoResiduals:
         the number of their states in rigid flight."""
         self.rollouts += len(candidates)
         frames = self._steps[: bisect_right(self._steps, self._last[count - 1])]
-        starts = [self._start(on, one) for one in candidates]
-        device, models = starts[0].x.device, [one.on(on.model) for one in candidates]
+        device, models = on.bodies[0].x0.device, [one.on(on.model) for one in candidates]
         laws = [[analytic_law(law, on.model.dt).to(device) for law in one.laws] for one in candidates]
+        starts = [self._start(on, *each) for each in zip(candidates, laws, strict=True)]
         flights = [self._flight(on, *each) for each in zip(candidates, laws, starts, strict=True)]
         paths: list[Trajectory | None] = [None] * len(candidates)
         for flown in {len(flight.frames) for flight in flights}:
@@ -275,12 +275,13 @@ class VideoResiduals:
         """Steps of a discretisation at the times of steps of the model."""
         return [round(n * self.model.dt / on.model.dt) for n in steps]
 
-    def _start(self, on: _Discretisation, one: Candidate) -> State:
+    def _start(self, on: _Discretisation, one: Candidate, laws: Sequence[Law]) -> State:
         """Initial state of a candidate."""
         deviations = one.deviations.reshape(-1, NUISANCES)[:, :MOTION]
         bodies = zip(self.motions, deviations, on.bodies, strict=True)
         states = [motion.moved(own).of_body(body) for motion, own, body in bodies]
-        return State.joined(states, separate=True) if len(states) > 1 else states[0]
+        start = State.joined(states, separate=True) if len(states) > 1 else states[0]
+        return with_fields(start, consecutive(laws, [len(state.x) for state in states]))
 
     def _flight(self, on: _Discretisation, one: Candidate, laws: Sequence[Law], start: State) -> Trajectory:
         """States before the first contact of a spinning body that its law keeps rigid, without frames if there are

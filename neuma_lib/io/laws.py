@@ -51,7 +51,7 @@ def save_law(path: str | Path, law: Law, about: Mapping[str, Any], separate_adap
     """
     own = {EXPORT: dict(about)}
     if not isinstance(law, AdaptableLaw):
-        own[ANALYTIC] = specification(law.elasticity, law.plasticity, law.viscosity)
+        own[ANALYTIC] = specification(law.elasticity, law.plasticity, law.viscosity, law.field)
         write_weights(path, {}, own)
     elif separate_adaptor:
         adaptor = next(iter(law.parts.values())).adaptor
@@ -122,8 +122,8 @@ def _read_law(path: str | Path, dt: float | None, any_time_step: bool) -> Law:
 def _specification(spec: Any, dt: float | None, key: str = STRUCTURED) -> dict[str, Any]:
     """Specification of an analytic law or of a base from the metadata, checked; its time step is replaced by ``dt``."""
     parts = [spec.get(part) for part in ("elasticity", "plasticity")] if isinstance(spec, dict) else [None]
-    if isinstance(spec, dict) and "viscosity" in spec:
-        parts.append(spec["viscosity"])
+    if isinstance(spec, dict):
+        parts += [spec[part] for part in ("viscosity", "field") if part in spec]
     if not all(isinstance(part, dict) for part in parts):
         raise InputError(f"metadata {key}", "must have an elasticity and a plasticity")
     for name, value in ((name, value) for part in parts for name, value in part.items() if name != "name"):

@@ -10,6 +10,7 @@ from torch import Tensor
 from neuma_lib.errors import InputError
 from neuma_lib.mechanics.catalogue import complete
 from neuma_lib.mechanics.elasticity import ELASTICITIES
+from neuma_lib.mechanics.fields import FIELDS, Field
 from neuma_lib.mechanics.law import Elasticity, Law, Plasticity
 from neuma_lib.mechanics.plasticity import PLASTICITIES
 from neuma_lib.mechanics.viscosity import VISCOSITIES, Viscosity
@@ -23,7 +24,7 @@ def analytic_law(spec: Mapping[str, Any], dt: float | None = None, name: str | N
 
     Args:
         spec: the parts, each with its ``name`` and constants. A plasticity inherits E and nu from the elasticity
-            by default. A missing plasticity is the identity. A ``viscosity`` is optional.
+            by default. A missing plasticity is the identity. A ``viscosity`` and a ``field`` are optional.
         dt: time step [s], required by rate-dependent parts (with the constant ``dt``).
         name: name used in messages, by default composed of the names of the parts.
 
@@ -32,29 +33,36 @@ def analytic_law(spec: Mapping[str, Any], dt: float | None = None, name: str | N
     """
     parts = complete(spec, dt)
     names = [part.pop("name") for part in parts.values()]
-    kinds = (ELASTICITIES, PLASTICITIES, VISCOSITIES)
-    elasticity, plasticity, *viscosity = (
-        known[own](**values) for known, own, values in zip(kinds, names, parts.values(), strict=False)
-    )
-    return Law(elasticity, plasticity, name or " + ".join(names), *viscosity)
+    kinds = {
+        "elasticity": ELASTICITIES,
+        "plasticity": PLASTICITIES,
+        "viscosity": VISCOSITIES,
+        "field": FIELDS,
+    }
+    built = {
+        part: kinds[part][own](**values) for own, (part, values) in zip(names, parts.items(), strict=True)
+    }
+    return Law(**built, name=name or " + ".join(names))
 
 
-def name_of(part: Elasticity | Plasticity | Viscosity) -> str | None:
+def name_of(part: Any) -> str | None:
     """Name of an analytic part in specifications, None if it has none."""
     return next((name for name, kind in part.named.items() if kind is type(part)), None)
 
 
 def specification(
-    elasticity: Elasticity, plasticity: Plasticity, viscosity: Viscosity | None = None
+    elasticity: Elasticity,
+    plasticity: Plasticity,
+    viscosity: Viscosity | None = None,
+    field: Field | None = None,
 ) -> dict[str, Any]:
     """Complete specification of analytic parts, including inherited constants (E, nu, dt).
 
     Raises:
         InputError: a part has no name or does not hold constants, so that a specification cannot describe it.
     """
-    parts = {"elasticity": elasticity, "plasticity": plasticity}
-    if viscosity is not None:
-        parts["viscosity"] = viscosity
+    given = {"elasticity": elasticity, "plasticity": plasticity, "viscosity": viscosity, "field": field}
+    parts = {name: part for name, part in given.items() if part is not None}
     for key, part in parts.items():
         if name_of(part) is None or not hasattr(part, "values"):
             problem = f"{type(part).__name__} is not described by a name and constants"

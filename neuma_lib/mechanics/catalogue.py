@@ -1,8 +1,8 @@
 """The built-in analytic laws: names, constants, units and bounds. Imports no torch, so that settings can be checked
 before it is loaded.
 
-A specification has the parts ``elasticity`` and optionally ``plasticity`` and ``viscosity``, each with its ``name`` and
-constants: ``{"elasticity": {"name": "hencky", "E": 3e5, "nu": 0.25}, "plasticity": {"name": "von_mises",
+A specification has the parts ``elasticity`` and optionally ``plasticity``, ``viscosity`` and ``field``, each with its
+``name`` and constants: ``{"elasticity": {"name": "hencky", "E": 3e5, "nu": 0.25}, "plasticity": {"name": "von_mises",
 "yield_stress": 5e3}}``
 """
 
@@ -52,6 +52,10 @@ POISSON = Constant("1", -1.0, 0.5)
 MODULI = {"E": YOUNG, "nu": POISSON}
 _STRESS = Constant("Pa", 0.0, closed=True)
 _STEP = Constant("s", 0.0)
+_DIRECTION = {
+    "azimuth": Constant("degrees", -180.0, 180.0, closed=True, default=0.0),
+    "elevation": Constant("degrees", -90.0, 90.0, closed=True, default=0.0),
+}
 
 ELASTICITY: dict[str, dict[str, Constant]] = {
     "fixed_corotated": MODULI,
@@ -67,8 +71,7 @@ ELASTICITY: dict[str, dict[str, Constant]] = {
         **MODULI,
         "fibre_modulus": _STRESS,
         "fibre_exponent": Constant("1", 0.0, closed=True),
-        "azimuth": Constant("degrees", -180.0, 180.0, closed=True, default=0.0),
-        "elevation": Constant("degrees", -90.0, 90.0, closed=True, default=0.0),
+        **_DIRECTION,
     },
 }
 """Constants of the elasticities by name."""
@@ -119,7 +122,13 @@ VISCOSITY: dict[str, dict[str, Constant]] = {
 }
 """Constants of the viscous parts by name. dt defaults to that of the simulation."""
 
-PARTS = {"elasticity": ELASTICITY, "plasticity": PLASTICITY, "viscosity": VISCOSITY}
+FIELD: dict[str, dict[str, Constant]] = {
+    "ramp": {"ratio": Constant("1", 0.0), **_DIRECTION},
+    "halves": {"ratio": Constant("1", 0.0), "boundary": Constant("1", 0.0, 1.0), **_DIRECTION},
+}
+"""Constants of the fields by name (`neuma_lib.mechanics.fields`)."""
+
+PARTS = {"elasticity": ELASTICITY, "plasticity": PLASTICITY, "viscosity": VISCOSITY, "field": FIELD}
 """Constants of all laws by part and name."""
 
 
@@ -149,7 +158,7 @@ def register(part: str, name: str, constants: Mapping[str, Constant], module: st
 
 def complete(spec: Mapping[str, Any], dt: float | None = None) -> dict[str, dict[str, Any]]:
     """A specification with elasticity and plasticity, E and nu in a plasticity that has these constants, and dt in
-    parts that have it. A viscosity is a part of the result if one is given.
+    parts that have it. A viscosity and a field are parts of the result if they are given.
 
     Args:
         spec: a plasticity inherits E and nu from the elasticity by default. A missing plasticity is the identity.
@@ -161,7 +170,7 @@ def complete(spec: Mapping[str, Any], dt: float | None = None) -> dict[str, dict
     if "elasticity" not in spec or not set(spec) <= set(PARTS):
         keys = ", ".join(map(str, spec)) or "none"
         raise InputError(
-            "law", f"its keys must be elasticity and optionally plasticity and viscosity, not {keys}"
+            "law", f"its keys must be elasticity and optionally plasticity, viscosity and field, not {keys}"
         )
     elastic = dict(spec["elasticity"])
     plastic = dict(spec.get("plasticity") or {"name": "identity"})
@@ -171,9 +180,10 @@ def complete(spec: Mapping[str, Any], dt: float | None = None) -> dict[str, dict
         if key in needed and key in elastic:
             plastic.setdefault(key, elastic[key])
     parts = {"elasticity": elastic, "plasticity": plastic}
-    if spec.get("viscosity"):
-        parts["viscosity"] = dict(spec["viscosity"])
-        _known_name("viscosity", parts["viscosity"], VISCOSITY)
+    for part in ("viscosity", "field"):
+        if spec.get(part):
+            parts[part] = dict(spec[part])
+            _known_name(part, parts[part], PARTS[part])
     for part, own in parts.items():
         if "dt" in PARTS[part][own["name"]] and "dt" not in own:
             if dt is None:
@@ -273,6 +283,11 @@ def viscous_stiffness(values: Mapping[str, float]) -> float:
     """
     modulus, relaxation = viscous_branch(values)
     return 4 / 3 * modulus / (1 + values["dt"] / (2 * relaxation))
+
+
+def stiffest(field: Mapping[str, Any] | None) -> float:
+    """Largest factor of a `FIELD` on the stress, 1 without one."""
+    return max(1.0, field["ratio"]) if field else 1.0
 
 
 def longitudinal_modulus(elasticity: Mapping[str, Any]) -> float:

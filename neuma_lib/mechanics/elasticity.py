@@ -176,7 +176,7 @@ class MooneyRivlin(AnalyticElasticity, name="mooney_rivlin"):
         return mu * shear + (lam + 2 * mu / 3) * log_J
 
 
-def _direction(azimuth: Tensor, elevation: Tensor) -> Tensor:
+def direction(azimuth: Tensor, elevation: Tensor) -> Tensor:
     """Unit vector (3,) of two angles in degrees."""
     azimuth, elevation = azimuth * (math.pi / 180), elevation * (math.pi / 180)
     return torch.stack([elevation.cos() * azimuth.cos(), elevation.sin(), elevation.cos() * azimuth.sin()])
@@ -197,13 +197,13 @@ class FibreReinforced(Hencky, name="fibre_reinforced"):
 
     @staticmethod
     def coefficients(E, nu, fibre_modulus, fibre_exponent, azimuth, elevation):
-        direction = _direction(azimuth, elevation).unbind()
-        return *Hencky.coefficients(E, nu), fibre_modulus / 2, fibre_exponent, *direction
+        along = direction(azimuth, elevation).unbind()
+        return *Hencky.coefficients(E, nu), fibre_modulus / 2, fibre_exponent, *along
 
     def response(self, F: Tensor, weights: Weights) -> Tensor:
         constants = self.with_weights(weights)
         mu, lam = lame(constants["E"], constants["nu"])
-        a_F = F @ _direction(
+        a_F = F @ direction(
             *(
                 torch.as_tensor(constants[key], dtype=F.dtype, device=F.device)
                 for key in ("azimuth", "elevation")

@@ -20,9 +20,10 @@ import torch
 from torch import Tensor, nn
 
 from neuma_lib.errors import NonFiniteError
-from neuma_lib.mechanics.catalogue import register, viscous_stiffness
+from neuma_lib.mechanics.catalogue import register, stiffest, viscous_stiffness
 
 if TYPE_CHECKING:
+    from neuma_lib.mechanics.fields import Field
     from neuma_lib.mechanics.viscosity import Viscosity
 
 Weights = tuple[Tensor, ...]
@@ -46,6 +47,8 @@ class Constitutive(nn.Module):
     """Whether the law is one of `analytic_kernels`, which `kernel_rows` describes."""
     keeps_singular_values = False
     """Whether these kernels can keep singular values for the adjoint (`analytic_kernels.new_cache`)."""
+    shares_singular_values = False
+    """Whether the kernel of a stress can read those that the kernel of the return map before it has kept."""
     identity = False
     """Whether the result is always F."""
     adjoint_precision: AdjointPrecision = "single"
@@ -179,6 +182,8 @@ class Law(nn.Module):
 
     Attributes:
         viscosity: spring and dashpot parallel to the elasticity (`neuma_lib.mechanics.viscosity`), or None.
+        field: factor on all stresses along the body (`neuma_lib.mechanics.fields`), or None. Simulations apply it. The
+            stresses of this class are those of the factor 1.
         grid: cells along the unit cube of the simulation that it was learned in, whose discretisation error it has
             absorbed; None if it does not depend on a grid. Simulations on another grid warn.
     """
@@ -191,20 +196,22 @@ class Law(nn.Module):
         plasticity: Plasticity,
         name: str = "law",
         viscosity: Viscosity | None = None,
+        field: Field | None = None,
     ):
         super().__init__()
         self.elasticity = elasticity
         self.plasticity = plasticity
         self.name = name
         self.viscosity = viscosity
+        self.field = field
 
     @classmethod
     def from_spec(cls, spec: Mapping[str, Any], dt: float | None = None) -> Law:
         """An analytic law from the names and constants of its parts (`analytic_law`).
 
         Args:
-            spec: ``elasticity`` and optionally ``plasticity`` and ``viscosity``, each with its ``name`` and constants
-                in SI units.
+            spec: ``elasticity`` and optionally ``plasticity``, ``viscosity`` and ``field``, each with its ``name`` and
+                constants in SI units.
             dt: time step of the simulation [s], required by rate-dependent parts.
 
         Raises:
@@ -300,7 +307,7 @@ class Law(nn.Module):
         return float(torch.linalg.eigvalsh(0.5 * (Q + Q.mT)).max())
 
     def wave_speed(self, rho: float) -> float:
-        """Largest speed of small elastic waves at F = I [m/s], for density rho [kg/m^3].
+        """Largest speed of small elastic waves at F = I [m/s], for density rho [kg/m^3], anywhere in the body.
 
         With a viscous part, that of an elastic law with the same limit of the time step
         (`catalogue.viscous_stiffness`).
@@ -308,7 +315,7 @@ class Law(nn.Module):
         modulus = max(self.longitudinal_modulus(), 0.0)
         if self.viscosity is not None:
             modulus += viscous_stiffness({key: float(v) for key, v in self.viscosity.values.items()})
-        return modulus**0.5 / rho**0.5
+        return (stiffest(self.field and self.field.values) * modulus / rho) ** 0.5
 
 
 def _imported(module: str) -> ModuleType:

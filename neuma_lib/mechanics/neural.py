@@ -91,9 +91,14 @@ class NeuralConstitutive(AdaptableConstitutive):
     scale: float
     capturable = True
     native = True
+    keeps_singular_values = True
     fused: bool | None = None
     """Whether evaluate and vjp use :mod:`neural_fused` or :mod:`neural_vector`: False never, True always, None where
     these are supported."""
+
+    @property
+    def loops(self) -> bool:
+        return self.fused is not False
 
     def graph_key(self) -> Hashable:
         return type(self), self.fused, self.adjoint_precision
@@ -136,8 +141,14 @@ class NeuralConstitutive(AdaptableConstitutive):
             return self._evaluate(F, weights, out, cache), cache
         if F.device.type != "cpu":
             return self.evaluate(F, weights, out), None
-        cache = neural_vector.new_cache(F) if cache is None else cache
+        cache = F.new_empty(self.cache_shape(F, weights)) if cache is None else cache
         return neural_vector.evaluate(F, weights, self.kind, self.scale, out, cache), cache
+
+    def kernel(self, F, weights, backward):
+        return neural_vector.kernel_of(self.kind, self.scale, F, weights, backward)
+
+    def cache_shape(self, F, weights):
+        return neural_vector.cache_shape(F)
 
     @torch.no_grad()
     def _evaluate(self, F, weights, out, state=None):

@@ -202,6 +202,7 @@ class StructuredConstitutive(AdaptableConstitutive):
     native = True
     loops = True
     keeps_singular_values = True
+    shares_singular_values = True
     network_kernel: tuple[str, kernels.Constants]
     """Kind of the kernel, and the constants of the law."""
 
@@ -444,7 +445,8 @@ class StructuredLaw(AdaptableLaw):
     def specification(self) -> dict[str, Any]:
         """Form and base, for `structured_law`."""
         base = getattr(self.plasticity, "analytic", self.plasticity)
-        return {"form": self.elasticity.form, **specification(self.elasticity.analytic, base, self.viscosity)}
+        parts = self.elasticity.analytic, base, self.viscosity, self.field
+        return {"form": self.elasticity.form, **specification(*parts)}
 
 
 def structured_law(
@@ -477,4 +479,6 @@ def structured_law(
     plasticity = base.plasticity
     if not isinstance(plasticity, Identity):
         plasticity = StructuredPlasticity(plasticity, weights("plasticity"), 2 * seed + 1)
-    return StructuredLaw(elasticity, plasticity, name or f"structured {base.name}", base.viscosity)
+    return StructuredLaw(
+        elasticity, plasticity, name or f"structured {base.name}", base.viscosity, base.field
+    )

@@ -125,12 +125,12 @@ def identified_table(scenes: Sequence[Mapping[str, Any]]) -> tuple[str, str]:
     return as_csv([["scene", "family", "family_is", "constants", *COLUMNS], *rows]), "\n".join(text)
 
 
-def _kind(spec: Mapping[str, Mapping[str, Any]]) -> tuple[str, str, bool, str]:
-    """Names of elasticity and plasticity, whether a viscous flow has a yield stress, and the name of a viscous part."""
+def _kind(spec: Mapping[str, Mapping[str, Any]]) -> tuple[str, str, bool, str, str]:
+    """Names of both parts, whether a viscous flow has a yield stress, and names of a viscous part and a field."""
     plasticity = spec.get("plasticity") or {"name": "identity"}
     yields = plasticity["name"] == "viscous_flow" and plasticity.get("yield_stress", 0) > 0
-    viscosity = (spec.get("viscosity") or {"name": ""})["name"]
-    return spec["elasticity"]["name"], plasticity["name"], yields, viscosity
+    others = [(spec.get(part) or {"name": ""})["name"] for part in ("viscosity", "field")]
+    return spec["elasticity"]["name"], plasticity["name"], yields, *others
 
 
 def _listed(quantities: Sequence[Mapping], determined: bool) -> str:

@@ -25,6 +25,7 @@ from neuma_lib.mechanics.catalogue import (
     PARTS,
     check_law,
     longitudinal_modulus,
+    stiffest,
     viscous_stiffness,
 )
 from neuma_lib.project.capture_scenes import checked_capture
@@ -79,11 +80,11 @@ def lines(error: InputError) -> list[str]:
 
 def _laws(settings: Config) -> Iterator[tuple[str, dict[str, Any]]]:
     """All laws in the settings with their keys; of ranges the two ends."""
-    drawn = set(settings.random_scenes)
+    drawn = {*settings.random_scenes, *settings.random_piles}
     for name, scene in settings.scenes.items():
         if scene.law is not None and name not in drawn and not scene.part_of:
             yield f"scenes.{name}.law", scene.law.plain()
-        for key, body in scene.bodies.items():
+        for key, body in scene.bodies.items() if name not in drawn else ():
             yield f"scenes.{name}.bodies.{key}.law", body.law.plain()
     for name, law in settings.priors.laws.items():
         yield f"priors.laws.{name}", law.plain()
@@ -96,8 +97,7 @@ def _laws(settings: Config) -> Iterator[tuple[str, dict[str, Any]]]:
     for group in ("families", "outside"):
         for name, family in getattr(settings.random, group).items():
             for end in (0, 1):
-                parts = {key: getattr(family, key) for key in PARTS}
-                yield f"random.{group}.{name}", {key: part.at(end) for key, part in parts.items() if part}
+                yield f"random.{group}.{name}", {key: part.at(end) for key, part in family.parts.items()}
 
 
 def _checked(where: str, spec: Mapping[str, Any], dt: float = 1.0) -> tuple[dict[str, Any] | None, list[str]]:
@@ -282,7 +282,7 @@ def _courant_problem(
     modulus = longitudinal_modulus(law["elasticity"])
     if "viscosity" in law:
         modulus += viscous_stiffness(law["viscosity"])
-    number = math.sqrt(modulus / rho) * dt * grid
+    number = math.sqrt(stiffest(law.get("field")) * modulus / rho) * dt * grid
     if number > COURANT_LIMIT:
         yield (
             f"{where}: the Courant number {number:.3g} exceeds {COURANT_LIMIT} with dt = {dt:g} s and {grid} grid "

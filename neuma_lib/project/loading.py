@@ -16,6 +16,7 @@ from neuma_lib.extensions import load_laws
 from neuma_lib.io.yaml_files import load_yaml
 from neuma_lib.methods.registry import built_in_presets
 from neuma_lib.project.consistency import check_consistency
+from neuma_lib.project.random_piles import draw_piles, without_first
 from neuma_lib.project.random_scenes import RandomConfig, draw_scenes
 from neuma_lib.project.renames import refuse_old_keys
 from neuma_lib.project.settings import Config
@@ -41,8 +42,9 @@ def load(
     named = read_yaml(scenes_file)
     refuse_old_keys({"scenes": named})
     scenes, changes = dict(named), raw.get("scenes") or {}
+    random = _random_scenes(raw)
     for kind, others in {
-        "random settings have": _random_scenes(raw),
+        "random settings have": random,
         "a capture has": captured or {},
     }.items():
         for name in others.keys() & scenes.keys():
@@ -54,7 +56,11 @@ def load(
     presets = raw.get("methods") or {}
     if isinstance(presets, Mapping):
         presets = merged(built_in_presets(extensions), presets)
-    settings = validate(Config, {**raw, "extensions": extensions, "scenes": changes, "methods": presets})
+    experiments = raw.get("experiments") or {}
+    if isinstance(experiments, Mapping):
+        experiments = without_first(random) | {**experiments}
+    complete = {"extensions": extensions, "scenes": changes, "methods": presets, "experiments": experiments}
+    settings = validate(Config, {**raw, **complete})
     check_consistency(settings, root)
     return settings
 
@@ -83,7 +89,8 @@ def _random_scenes(raw: Mapping[str, Any]) -> dict[str, Any]:
         random, priors, simulation = (validate(kind, raw.get(key, {}), key) for key, kind in kinds.items())
     except InputError:
         return {}
-    return draw_scenes(random, priors.laws, simulation.grid, simulation.gravity)
+    draw = draw_piles if random.bodies else draw_scenes
+    return draw(random, priors.laws, simulation.grid, simulation.gravity)
 
 
 def _with_takes(scenes: Mapping[str, Any]) -> dict[str, Any]:

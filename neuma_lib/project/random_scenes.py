@@ -20,7 +20,7 @@ from neuma_lib.config.base import Section, Seed, Vector, internal, no_boolean
 from neuma_lib.config.dataset import CONVERGED
 from neuma_lib.config.laws import LawConfig
 from neuma_lib.errors import InputError
-from neuma_lib.mechanics.catalogue import PARTS, viscous_stiffness
+from neuma_lib.mechanics.catalogue import viscous_stiffness
 
 Item = TypeVar("Item")
 
@@ -118,6 +118,13 @@ class FamilyConfig(Section):
     plasticity: DrawnPart = Field(DrawnPart(name="identity"), description="the same of the return map")
     viscosity: DrawnPart | None = Field(None, description="the same of the viscous part; null: none")
 
+    @property
+    def parts(self) -> dict[str, DrawnPart]:
+        """Given parts of the law, in the order in which they are drawn."""
+        return {
+            key: part for key in ("elasticity", "plasticity", "viscosity") if (part := getattr(self, key))
+        }
+
     @model_validator(mode="after")
     def _has_a_wave_speed(self) -> FamilyConfig:
         ranges = self.elasticity.ranges
@@ -147,6 +154,12 @@ class RandomConfig(Section):
     )
     shapes: tuple[Literal[tuple(SHAPES)], ...] = internal(
         tuple(SHAPES), "shapes, which consecutive scenes take in turn", min_length=1
+    )
+    bodies: tuple[int, int] | None = internal(
+        None, "minimum and maximum number of bodies of a scene, which touch each other; null: one body"
+    )
+    pair_friction: PositiveRange = internal(
+        (0.1, 0.8), "minimum and maximum of the Coulomb coefficient of two bodies"
     )
     converged: float = internal(
         0.0, "share of the scenes with a converged truth; the others have that of `dataset`", ge=0, le=1
@@ -239,8 +252,8 @@ def draw_scenes(
         rng = np.random.default_rng([settings.seed, 2, k])
         rejected: Counter[str] = Counter()
         for _ in range(ATTEMPTS):
-            scene = _drawn(rng, settings, shape, families[family])
-            dt = _largest_stable(settings, [scene["law"], *laws], grid)
+            scene = draw_one(rng, settings, shape, families[family])
+            dt = largest_stable(settings, [scene["law"], *laws], grid)
             reason = "unstable" if dt is None else _rejection(settings, scene, gravity)
             if reason is None:
                 break
@@ -250,8 +263,8 @@ def draw_scenes(
             problem = f"{ATTEMPTS} draws of a {shape} of the family {family} are unusable: {reasons}"
             raise InputError("random", problem, "Change the ranges")
         scene |= {"dt": dt, "steps": STEPS * max(1, round(scene.pop("duration") / dt / STEPS))}
-        scene |= _contact_and_truth(settings, k)
-        scene["appearance"] = _appearance(settings, k, shape, family)
+        scene |= contact_and_truth(settings, k)
+        scene["appearance"] = appearance(settings, k, shape, family)
         scenes[f"{settings.prefix}{k:02d}_{shape}_{family}"] = scene
     return scenes
 
@@ -262,36 +275,35 @@ def _dealt(items: Sequence[Item], seed: int, deck: int, k: int) -> Item:
     return items[np.argsort(np.random.default_rng([seed, deck, number]).random(len(items)))[place]]
 
 
-def _drawn(
+def draw_one(
     rng: np.random.Generator, settings: RandomConfig, shape: str, family: FamilyConfig
 ) -> dict[str, Any]:
     """A random scene without time step and appearance, usable or not."""
 
     def uniform(bounds: tuple[float, float]) -> float:
-        return _rounded(bounds[0] + (bounds[1] - bounds[0]) * rng.random())
+        return rounded(bounds[0] + (bounds[1] - bounds[0]) * rng.random())
 
     def part(drawn: DrawnPart) -> dict[str, Any]:
         ranges = sorted(drawn.ranges.items())
-        constants = {key: _rounded(low * (high / low) ** rng.random()) for key, (low, high) in ranges}
+        constants = {key: rounded(low * (high / low) ** rng.random()) for key, (low, high) in ranges}
         return {"name": drawn.name, **constants}
 
-    parts = {key: getattr(family, key) for key in PARTS}
     return {
         "shape": shape,
         "size": uniform(settings.size),
         "height": uniform(settings.height),
         "center": [uniform(settings.center), uniform(settings.center)],
         "velocity": [uniform(bounds) for bounds in settings.velocity],
-        "spin": [_rounded(uniform(settings.spin) * n) for n in _direction(rng)],
+        "spin": [rounded(uniform(settings.spin) * n) for n in _direction(rng)],
         "duration": uniform(settings.duration),
-        "law": {key: part(drawn) for key, drawn in parts.items() if drawn},
+        "law": {key: part(drawn) for key, drawn in family.parts.items()},
         "density": DENSITY,
         "prior": family.prior,
         "story": f"drawn at random with seed {settings.seed}",
     }
 
 
-def _contact_and_truth(settings: RandomConfig, k: int) -> dict[str, Any]:
+def contact_and_truth(settings: RandomConfig, k: int) -> dict[str, Any]:
     """Friction of a scene and resolution of its truth, if they are not those of all scenes.
 
     Converged truths are evenly distributed: of the first n scenes, round(n * share) have one.
@@ -302,7 +314,7 @@ def _contact_and_truth(settings: RandomConfig, k: int) -> dict[str, Any]:
     if settings.friction:
         low, high = settings.friction
         draw = np.random.default_rng([settings.seed, 4, k]).random()
-        chosen["friction"] = _rounded(low * (high / low) ** draw)
+        chosen["friction"] = rounded(low * (high / low) ** draw)
     return chosen
 
 
@@ -313,12 +325,12 @@ def _direction(rng: np.random.Generator) -> list[float]:
     return [flat * math.cos(turn), up, flat * math.sin(turn)]
 
 
-def _rounded(value: float) -> float:
+def rounded(value: float) -> float:
     """Three significant digits, without the last bits in which machines differ."""
     return float(f"{value:.3g}")
 
 
-def _largest_stable(settings: RandomConfig, laws: Sequence[Mapping], grid: int) -> float | None:
+def largest_stable(settings: RandomConfig, laws: Sequence[Mapping], grid: int) -> float | None:
     """The largest time step [s] that is stable for all laws, by the speed of pressure waves at small strains."""
 
     def courant(dt: float) -> float:
@@ -403,7 +415,7 @@ def _first(true: np.ndarray) -> float:
     return int(true.argmax()) if true.any() else math.inf
 
 
-def _appearance(settings: RandomConfig, k: int, shape: str, family: str) -> dict[str, Any]:
+def appearance(settings: RandomConfig, k: int, shape: str, family: str) -> dict[str, Any]:
     """Different colours of the parts, and patches that make the motion visible."""
     rng = np.random.default_rng([settings.seed, 3, k])
 
@@ -415,6 +427,6 @@ def _appearance(settings: RandomConfig, k: int, shape: str, family: str) -> dict
         "kind": settings.materials[family].look,
         "colors": {part: colour() for part in SHAPES[shape].parts},
         "accent": colour(),
-        "contrast": _rounded(0.35 + 0.25 * rng.random()),
+        "contrast": rounded(0.35 + 0.25 * rng.random()),
         "seed": k,
     }

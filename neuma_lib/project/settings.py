@@ -113,9 +113,17 @@ class Config(Section):
 
     @property
     def random_scenes(self) -> list[str]:
-        """Names of the scenes drawn at random, in order."""
-        drawn = (name for name in self.scenes if name.startswith(self.random.prefix))
-        return [name for name in drawn if self.scenes[name].has_truth]
+        """Names of the scenes of one body drawn at random, in order."""
+        return [name for name in self._drawn if self.scenes[name].has_truth and not self.scenes[name].part_of]
+
+    @property
+    def random_piles(self) -> list[str]:
+        """Names of the scenes of several bodies drawn at random, in order."""
+        return [name for name in self._drawn if self.scenes[name].bodies]
+
+    @property
+    def _drawn(self) -> list[str]:
+        return [name for name in self.scenes if name.startswith(self.random.prefix)]
 
     @property
     def plain_scenes(self) -> list[str]:

@@ -11,7 +11,7 @@ import torch
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.mechanics.law import Law
 from neuma_lib.mechanics.side_by_side import fusible, has_kernels, side_by_side
-from neuma_lib.sim.model import MPM, consecutive, model_of_each
+from neuma_lib.sim.model import MPM, consecutive, model_of_each, with_fields
 from neuma_lib.sim.rollout import check_bodies, check_inside, checked_frames, fly_and_simulate
 from neuma_lib.sim.state import State, Trajectory
 from neuma_lib.threads import in_threads
@@ -73,6 +73,10 @@ def rollout_batch(
     for state in {id(state): state for state in starts}.values():
         check_bodies(model, state)
         check_inside(model, state.x)
+    starts = [
+        with_fields(state, consecutive(_each(own), state.bodies if _bodies(own) > 1 else (len(state.x),)))
+        for own, state in zip(laws, starts, strict=True)
+    ]
     order = sorted(range(len(laws)), key=lambda copy: not _fusible(laws[copy]))
     device, dtype = starts[0].x.device, starts[0].x.dtype
     together = together or TOGETHER[device.type]

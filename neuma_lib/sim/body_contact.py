@@ -54,7 +54,6 @@ def body_functions(dtype: torch.dtype, GridConstants: type) -> SimpleNamespace:
     vec3, vec4 = (wp.types.vector(length=n, dtype=real) for n in (3, 4))
 
     # One function, because Warp 1.19 leaves out the adjoint of a nested one that a forward function uses too.
-    # One function, because Warp 1.19 leaves out the adjoint of a nested one that a forward function uses too.
     @wp.func
     def jump(friction: real, a: vec4, b: vec4, v: vec3):
         """s (p n - q) of a pair. a and b are the gradient and the mean of the volume fraction of each body."""

@@ -50,6 +50,7 @@ def branched(
         with_branches(state.C),
         None if state.clamp is None else with_branches(state.clamp),
         with_branches(state.stuck),
+        stiffness=None if state.stiffness is None else with_branches(state.stiffness),
     )
     return tuple(extended), both, owners
 

@@ -17,6 +17,7 @@ from neuma_lib.mechanics.law import Law, Weights
 from neuma_lib.sim.bodies import Pair
 from neuma_lib.sim.clamps import Clamp
 from neuma_lib.sim.colliders import Collider, contact_radius, unit_cube
+from neuma_lib.sim.state import State
 
 WALLS = ("x_min", "x_max", "y_min", "y_max", "z_min", "z_max")
 CONDITIONS = ("no_slip", "slip", "sticky")
@@ -258,6 +259,18 @@ def consecutive(laws: Sequence[Law], counts: Sequence[int]) -> tuple[MaterialReg
     """Consecutive regions with the given laws and numbers of particles."""
     ends = list(accumulate(counts))
     return tuple(MaterialRegion(law, end - n, end) for law, n, end in zip(laws, counts, ends, strict=True))
+
+
+def with_fields(state: State, regions: Sequence[MaterialRegion]) -> State:
+    """The state of bodies at rest with the factors of the fields of their laws, unless it has factors."""
+    if state.stiffness is not None or all(region.law.field is None for region in regions):
+        return state
+    factors = torch.ones_like(state.mass)
+    for region in regions:
+        if region.law.field is not None:
+            own = slice(region.start, region.stop)
+            factors[own] = region.law.field.factors(state.x[own].detach())
+    return replace(state, stiffness=factors)
 
 
 def contact_clearance(model: MPM, x: Tensor, vol0: Tensor, steps: Sequence[int] = (0,)) -> Tensor:

@@ -20,7 +20,7 @@ from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.branches import branched, merged
 from neuma_lib.sim.free_flight import ballistic, free_flight_steps
 from neuma_lib.sim.memory import DEFAULT_CACHE_BYTES, plan_memory
-from neuma_lib.sim.model import MPM, MaterialRegion, as_regions
+from neuma_lib.sim.model import MPM, MaterialRegion, as_regions, with_fields
 from neuma_lib.sim.scatter import scatter_for
 from neuma_lib.sim.simulation import Simulation, gather_weights
 from neuma_lib.sim.state import State, Trajectory
@@ -51,7 +51,7 @@ def rollout(
     Args:
         model: grid, time step, gravity, walls, colliders and clamps.
         law: law of all particles, or regions with their own laws.
-        state: initial state of N particles.
+        state: initial state of N particles. Fields of laws need the body at rest, unless the state has ``stiffness``.
         steps: number of time steps, not less than the last frame, at which the simulation ends.
         frames: steps whose states are returned, strictly increasing, 0 is the initial state.
         tracers: positions of passive points that follow the velocity of the grid [m], shape (M, 3).
@@ -75,6 +75,7 @@ def rollout(
     """
     frames = checked_frames(frames, steps)
     regions = as_regions(law, len(state.x))
+    state = with_fields(state, regions)
     check_inside(model, state.x)
     if tracers is not None and (tracers.ndim != 2 or tracers.shape[1] != 3 or tracers.dtype != state.x.dtype):
         given = f"shape {tuple(tracers.shape)} as {tracers.dtype}"

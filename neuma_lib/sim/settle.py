@@ -10,7 +10,7 @@ import torch
 from neuma_lib.errors import InputError
 from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.clamps import clamped_particles
-from neuma_lib.sim.model import MPM, MaterialRegion, as_regions
+from neuma_lib.sim.model import MPM, MaterialRegion, as_regions, with_fields
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 
@@ -52,6 +52,7 @@ def settle(
     """
     clamps = tuple(replace(clamp.at_rest(), release=float("inf")) for clamp in model.clamps)
     still = replace(model, colliders=tuple(each.at_rest() for each in model.colliders), clamps=clamps)
+    state = with_fields(state, as_regions(law, len(state.x)))
     regions = [
         replace(each, law=Law(each.law.elasticity, each.law.plasticity, each.law.name))
         for each in as_regions(law, len(state.x))

@@ -107,7 +107,9 @@ class Simulation:
             )
         self.workspace = pooled_workspace(size, user=self)
         frictions = frictions or [model.frictions] * copies
-        self.workspace.load_particles(state.mass.detach(), state.vol0.detach(), np.array(frictions))
+        stiffness = 1.0 if state.stiffness is None else state.stiffness.detach()
+        particles = state.mass.detach(), state.vol0.detach()
+        self.workspace.load_particles(*particles, np.array(frictions), stiffness)
         if model.clamps:
             clamp = clamped_particles(model.clamps, state.x.detach()) if state.clamp is None else state.clamp
             self.workspace.clamp.copy_(clamp)

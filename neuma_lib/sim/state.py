@@ -27,6 +27,7 @@ class State:
         clamp: index of the clamp that holds each particle, or -1, shape (N,), by default from the positions.
         stuck: tangential displacements since particles stick to a `Collider` [m], shape (N, 3), by default zero.
         F_branch: deformation gradients of the viscous branch of a law, shape (N, 3, 3). None: relaxed.
+        stiffness: factors on the stress of the particles, shape (N,), see `neuma_lib.mechanics.fields`. None: 1.
         bodies: number of particles of each body, one after the other. Each of several bodies has its own velocities on
             the grid and touches the others as `body_contact` states. Without bodies all particles are one.
 
@@ -45,6 +46,7 @@ class State:
     stuck: Tensor = None  # type: ignore[assignment]
     F_branch: Tensor | None = None
     bodies: tuple[int, ...] = ()
+    stiffness: Tensor | None = None
 
     def __post_init__(self):
         x = self.x
@@ -62,8 +64,8 @@ class State:
             object.__setattr__(self, "stuck", torch.zeros_like(x))
         shapes = {"x": [(N, 3)], "v": [(N, 3), (3,)], "mass": [(N,)], "vol0": [(N,)]}
         shapes |= {"F": [(N, 3, 3)], "C": [(N, 3, 3)], "stuck": [(N, 3)]}
-        if self.F_branch is not None:
-            shapes["F_branch"] = [(N, 3, 3)]
+        optional = {"F_branch": [(N, 3, 3)], "stiffness": [(N,)]}
+        shapes |= {name: shape for name, shape in optional.items() if getattr(self, name) is not None}
         for name, allowed in shapes.items():
             value = getattr(self, name)
             if tuple(value.shape) not in allowed:
@@ -76,7 +78,7 @@ class State:
                 )
             if not torch.isfinite(value).all():
                 raise InputError(f"state.{name}", "a value is not finite")
-            if name in ("mass", "vol0") and not (value > 0).all():
+            if name in ("mass", "vol0", "stiffness") and not (value > 0).all():
                 raise InputError(f"state.{name}", f"{float(value.min()):g} must be positive")
         if self.clamp is not None and self.clamp.shape != (N,):
             raise InputError("state.clamp", f"shape {tuple(self.clamp.shape)} must be ({N},)")
@@ -134,8 +136,14 @@ class State:
             branches = torch.cat(
                 [relaxed.expand_as(body.F) if body.F_branch is None else body.F_branch for body in bodies]
             )
+        stiffness = None
+        if any(body.stiffness is not None for body in bodies):
+            stiffness = torch.cat(
+                [torch.ones_like(body.mass) if body.stiffness is None else body.stiffness for body in bodies]
+            )
         counts = tuple(len(body.x) for body in bodies) if separate else ()
-        return cls(x, v, mass, vol0, F, C, torch.cat(clamps) if clamps else None, stuck, branches, counts)
+        held = torch.cat(clamps) if clamps else None
+        return cls(x, v, mass, vol0, F, C, held, stuck, branches, counts, stiffness)
 
     def after(self, path: Trajectory, frame: int = -1) -> State:
         """The state at the frame of this index of a trajectory, from which a simulation continues exactly."""
@@ -148,7 +156,7 @@ class State:
         moved = {
             name: getattr(self, name).to(device) for name in ("x", "v", "mass", "vol0", "F", "C", "stuck")
         }
-        optional = {"clamp": self.clamp, "F_branch": self.F_branch}
+        optional = {name: getattr(self, name) for name in ("clamp", "F_branch", "stiffness")}
         given = {name: value.to(device) for name, value in optional.items() if value is not None}
         return State(**moved, **given, bodies=self.bodies)
 

@@ -93,7 +93,7 @@ class Workspace:
         F_trial: trial deformation gradients, shape (n_cached_steps, N, 3, 3).
         grid: momentum [kg m/s] and mass [kg] of the nodes, shape (n_cached_steps, fields * nodes^3, 4).
         grid_v: velocity [m/s] of the nodes and 1 where there is mass, shape (n_cached_steps, fields * nodes^3, 4).
-        mass, vol0: particle masses [kg] and initial volumes [m^3], shape (N,).
+        mass, vol0: particle masses [kg], and initial volumes [m^3] times `State.stiffness`, shape (N,).
         radius: radii of the particles in contact [m], shape (N,).
         frictions: `MPM.frictions` of each copy, shape (copies, colliders + pairs).
         pairs: `bodies.pair_table` of each copy, shape (copies * bodies, bodies + 1).
@@ -215,10 +215,12 @@ class Workspace:
             _run(self._cells, self.at(step))
             self.order[self.sorted_at(step)].copy_(torch.sort(self.cells, stable=True).indices)
 
-    def load_particles(self, mass: Tensor, vol0: Tensor, frictions: np.ndarray) -> None:
-        """Set masses [kg], volumes [m^3] and radii of the particles, and `frictions`."""
+    def load_particles(
+        self, mass: Tensor, vol0: Tensor, frictions: np.ndarray, stiffness: Tensor | float = 1.0
+    ) -> None:
+        """Set masses [kg], volumes [m^3], factors on the stress and radii of the particles, and `frictions`."""
         self.mass.copy_(mass)
-        self.vol0.copy_(vol0)
+        self.vol0.copy_(stiffness * vol0)  # multiplies the stress only
         self.radius.copy_(contact_radius(vol0))
         changed, self.frictions = not np.array_equal(frictions, self.frictions), frictions
         if self.size.ranges:

@@ -25,7 +25,7 @@ from neuma_lib.io.exported import SAME_STEP
 from neuma_lib.mechanics.adaptor import AdaptableLaw
 from neuma_lib.mechanics.law import Law
 from neuma_lib.mechanics.time_step import step_dependence
-from neuma_lib.sim.model import MPM, consecutive
+from neuma_lib.sim.model import MPM, consecutive, with_fields
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State, Trajectory
 
@@ -213,6 +213,7 @@ class LiveSimulation:
         self._first_law, self._first_dt = law, dt
         self._laws[0], self._dts[0] = law, dt
         self._apply_weight()
+        self._apply_fields()
 
     @_queued
     def launch(self, velocity: Sequence[float]) -> None:
@@ -268,6 +269,8 @@ class LiveSimulation:
         self._total = torch.cat([self._total, _undeformed(body.x)])
         self._counts, self._laws = [*self._counts, len(body.x)], [*self._laws, law]
         self._dts = [*self._dts, dt]
+        self._at_rest.append(added)
+        self._apply_fields()
         self._apply_weight()
 
     def to_box(self, vector: Sequence[float]) -> np.ndarray:
@@ -403,11 +406,16 @@ class LiveSimulation:
 
     def _restart(self) -> None:
         self._state, self._counts = self._start, [len(self._start.x)]
-        self._laws, self._dts = [self._first_law], [self._first_dt]
+        self._laws, self._dts, self._at_rest = [self._first_law], [self._first_dt], [self._start]
+        self._apply_fields()
         self._total = _undeformed(self._start.x)
         self._time = self._measured_time = 0.0
         self._hand = self._trouble = None
         self._publish()
+
+    def _apply_fields(self) -> None:
+        at_rest = with_fields(State.joined(self._at_rest), consecutive(self._laws, self._counts))
+        self._state = replace(self._state, stiffness=at_rest.stiffness)
 
     def _apply_weight(self) -> None:
         for law in self._laws:

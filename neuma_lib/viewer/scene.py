@@ -241,7 +241,8 @@ def _values(
         "volume_ratio": scalars.volume_ratio(F),
     }
     if law is not None:
-        values["von_mises"] = torch.stack([scalars.von_mises(law, frame) for frame in F])
+        factors = 1.0 if law.field is None else law.field.factors(x[0])
+        values["von_mises"] = torch.stack([factors * scalars.von_mises(law, frame) for frame in F])
     return values
 
 

@@ -64,6 +64,28 @@ rule random_table:
         "../scripts/random_table.py"
 
 
+rule piles_table:
+    input:
+        [file for name in SETTINGS.random_piles for own in pile_files(name).values() for file in own],
+    output:
+        csv=report(f"{RESULTS}/piles.csv", caption="../report/piles.rst", category="Tables"),
+        markdown=f"{RESULTS}/piles.md",
+    params:
+        scenes=[
+            {
+                "name": name,
+                "bodies": {body: own.law.plain() for body, own in SETTINGS.scene(name).bodies.items()},
+                "frictions": [pair.plain() for pair in SETTINGS.scene(name).pairs],
+            }
+            for name in SETTINGS.random_piles
+        ],
+        files=[pile_files(name) for name in SETTINGS.random_piles],
+        seed=SETTINGS.random.seed,
+        development=SETTINGS.random.is_development,
+    script:
+        "../scripts/piles_table.py"
+
+
 rule random:
     input:
         rules.random_table.output,

@@ -23,6 +23,19 @@ def random_files(methods, name):
     return [f"{RESULTS}/{scene}/{method}/{name}" for method in methods for scene in SETTINGS.random_scenes]
 
 
+def pile_files(name):
+    """Files of a random scene of several bodies for its table, by content."""
+    alone = SETTINGS.body_scenes(name)
+    laws = "true_law", "constants"
+    return {
+        "identified": [f"{RESULTS}/{name}/identified.json"],
+        "metrics": [f"{RESULTS}/{name}/{law}/metrics.json" for law in laws],
+        "alone": [f"{RESULTS}/{body}/identified.json" for body in alone],
+        "alone_metrics": [f"{RESULTS}/{body}/constants/metrics.json" for body in alone],
+        "rest": [f"{RESULTS}/experiments/{name}_rest/{law}/metrics.json" for law in laws],
+    }
+
+
 def identified_scenes():
     """Every identification in a table: the scenes of table1 in all replicates, and the random scenes."""
     table, constants = SETTINGS.tables.get("table1"), cases.of_kind(SETTINGS, "constants")[:1]

@@ -1,0 +1,102 @@
+"""Identification of a block whose stiffness changes along it, against candidates that are uniform."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from neuma_lib.config.identify import IdentifyConfig
+from neuma_lib.config.laws import LawConfig
+from neuma_lib.coupling.initial_motion import InitialMotion
+from neuma_lib.fitting.families import Family
+from neuma_lib.fitting.identify import identify
+from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.sim.rollout import rollout
+from neuma_lib.splatting.observation import Observation
+from tests.support.grounding_scene import MODEL, block, camera
+from tests.support.sim_scenes import law_spec as law
+
+pytestmark = pytest.mark.core
+
+FRAMES = tuple(range(0, 121, 8))
+VELOCITY = (0.3, -1.5, 0.0)
+GUESS = law("hencky", E=2e5)
+FAMILIES = {
+    "uniform": GUESS,
+    "ramp": {**GUESS, "field": {"name": "ramp", "ratio": 1.0}},
+    "halves": {**GUESS, "field": {"name": "halves", "ratio": 1.0, "boundary": 0.5}},
+}
+
+
+def identified(field, E=4e4, velocity=VELOCITY, seed=5):
+    """The block filmed with noise, identified from a uniform guess."""
+    body, truth = block(), law("hencky", E=E)
+    with torch.no_grad():
+        own = analytic_law({**truth, **({"field": field} if field else {})}, MODEL.dt)
+        path = rollout(MODEL, own, body.state(velocity), steps=FRAMES[-1], frames=FRAMES, total=True)
+        images = body.particle_gs(camera())(path.x, path.F_total)
+    noise = torch.randn(images.shape, generator=torch.Generator().manual_seed(seed), dtype=images.dtype)
+    centre = (body.mass @ body.x0 / body.mass.sum()).numpy()
+    motion = InitialMotion(np.array(velocity), np.zeros(3), centre, np.eye(3), np.zeros(6))
+    families = {name: LawConfig(**spec) for name, spec in FAMILIES.items()}
+    settings = IdentifyConfig(families=families, pyramid=(4, 8, 32), pose_tolerance=0.0)
+    video = Observation(FRAMES, images + 0.01 * noise, camera())
+    return identify(MODEL, motion, body, video, settings)
+
+
+@pytest.mark.parametrize("ratio", [3.0, 0.3])
+def test_a_ramp(ratio):
+    result = identified({"name": "ramp", "ratio": ratio})
+    assert result.best.family.name == "ramp" and "uniform" not in result.ties
+    assert result.best.values["E"] == pytest.approx(4e4, rel=0.1)
+    assert result.best.values["ratio"] == pytest.approx(ratio, rel=0.1)
+    assert result.best.family.law_spec(result.best.values)["field"]["name"] == "ramp"
+
+
+def test_two_halves():
+    result = identified({"name": "halves", "ratio": 0.3, "boundary": 0.6})
+    assert result.best.family.name == "halves" and "uniform" not in result.ties
+    assert result.best.values["E"] == pytest.approx(4e4, rel=0.1)
+    assert result.best.values["ratio"] == pytest.approx(0.3, rel=0.1)
+    assert result.best.values["boundary"] == pytest.approx(0.6, abs=0.03)
+
+
+def test_a_uniform_block_is_uniform():
+    result = identified(None)
+    assert result.best.family.name == "uniform"
+    assert result.best.values["E"] == pytest.approx(4e4, rel=0.1)
+
+
+def test_limits_of_families_with_fields():
+    uniform, ramp, halves = (Family(name, spec) for name, spec in FAMILIES.items())
+    assert ramp.constants == ("E", "nu", "ratio") and not ramp.flows
+    assert ramp.contains(uniform) and halves.contains(uniform)
+    assert not halves.contains(ramp) and not uniform.contains(ramp)
+    stiff = {"E": 1e12, "nu": 0.3}
+    limits = [own.limited({**own.guess, **stiff}, MODEL, 1000.0)["E"] for own in (uniform, ramp)]
+    assert limits[0] == limits[1]
+    steep = ramp.limited({**stiff, "ratio": 4.0}, MODEL, 1000.0)["E"]
+    assert steep == pytest.approx(limits[0] / 4)
+
+
+@pytest.mark.slow
+def test_random_blocks():
+    """Of ten random blocks each: ends within 15 %, the boundary within 0.1, and uniform ones uniform in nine."""
+    draw, right = np.random.default_rng(0), {name: [] for name in FAMILIES}
+    for seed in range(10):
+        ratio = math.exp(draw.uniform(math.log(1.8), math.log(5)) * (-1) ** seed)
+        E = min(math.exp(draw.uniform(math.log(4e4), math.log(1e5))), 1e5 / max(ratio, 1))
+        velocity, boundary = (draw.uniform(-0.8, 0.8), draw.uniform(-2, -1), 0.0), draw.uniform(0.3, 0.7)
+        fields = {"ramp": {"ratio": ratio}, "halves": {"ratio": ratio, "boundary": boundary}}
+        for name in FAMILIES:
+            field = {"name": name, **fields[name]} if name in fields else None
+            best = identified(field, E, velocity, seed).best
+            ends = [E, E * ratio] if field else [E]
+            fitted = [best.values["E"] * share for share in (1.0, best.values.get("ratio", 1.0))]
+            close = all(abs(own / end - 1) < 0.15 for own, end in zip(fitted, ends, strict=False))
+            placed = name != "halves" or abs(best.values.get("boundary", 0.0) - boundary) < 0.1
+            right[name].append(best.family.name == name and close and placed)
+    assert {name: sum(met) for name, met in right.items()} == pytest.approx(
+        dict.fromkeys(FAMILIES, 10), abs=1
+    )
