@@ -120,6 +120,8 @@ class Simulation:
         laws = [getattr(region.law, part) for region in regions for part in PARTS]
         self._uses_graphs = x.device.type == "cuda" and all(law.capturable for law in laws)
         self._loops = self.workspace.native and all(law.loops for law in laws)
+        for law in (region.law for region in regions):  # no kernel adds the gradient of this stress
+            self._loops &= law.plasticity.native_rows or not law.elasticity.native_rows
         self._loop: SegmentLoop | None = None
         self.errors: list[NonFiniteError | None] = [None] * copies
         self._graph_key = tuple((b.start, b.stop) for b in regions), tuple(law.graph_key() for law in laws)
