@@ -218,7 +218,7 @@ def test_segments_of_learned_laws_equal_steps_of_python(learned, monkeypatch):
 @pytest.mark.parametrize("elastic", ["von_mises", "networks", "structured"])
 @pytest.mark.parametrize("plastic", ["von_mises", "networks", "structured"])
 def test_parts_of_different_kinds(elastic, plastic, monkeypatch):
-    """A law whose parts are analytic, networks or structured moves as in steps of Python, and has the same gradients."""
+    """A law whose parts are analytic, networks or structured moves as in steps of Python, with the same gradients."""
     laws = {
         "von_mises": make_law("von_mises"),
         "networks": neural_law().double(),
