@@ -1,6 +1,14 @@
 // Kernels of neural_vector.py: both directions of a network over blocks of BLOCK rows on a CPU. SVD, features and
 // stress hold a row per SIMD lane, the layers an output per lane. The module defines constants and polynomials.
 
+// Features are sigma - 1 (3), F^T F - I (9, row-major) and det F - 1 (1). The SVD scales a[], so this part precedes it.
+//// gram
+    Pack gram[9], det;
+    for (int i = 0; i < 3; ++i)
+        for (int j = 0; j < 3; ++j) gram[3 * i + j] = a[i] * a[j] + a[3 + i] * a[3 + j] + a[6 + i] * a[6 + j];
+    det = a[0] * (a[4] * a[8] - a[5] * a[7]) - a[1] * (a[3] * a[8] - a[5] * a[6])
+        + a[2] * (a[3] * a[7] - a[4] * a[6]);
+
 // Tiles of matrix products, in registers: ROWS rows times COLUMNS packs.
 //// tools
     // 512 bits of consecutive numbers of a row

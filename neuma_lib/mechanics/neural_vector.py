@@ -16,11 +16,13 @@ from torch import Tensor
 
 from neuma_lib.device import native_source
 from neuma_lib.mechanics.analytic_kernels import CPU_WIDTH
-from neuma_lib.mechanics.fused_launch import contiguous, launch_blocks
+from neuma_lib.mechanics.fused_launch import addressed, contiguous, launch_blocks
 from neuma_lib.mechanics.law import Weights
-from neuma_lib.mechanics.neural_kernels import FEATURES, GRAM
 from neuma_lib.mechanics.singular_values_kernels import END, FUSE, SVD, TYPES, filled, warp_types
 
+FEATURES = 13
+GRAM = native_source(__file__, ".h")["gram"]
+"""C++ source of F^T F and det F."""
 BLOCK = 64
 """Rows per block."""
 HIDDEN = 64
@@ -90,19 +92,13 @@ def evaluate_kernel(dtype: torch.dtype):
 
     If ``cached`` is 1, it fills the cache.
     """
-    real, _, _ = warp_types(dtype)
+    own = addressed(elastic=int, scale=warp_types(dtype)[0], n=int, cached=int)
 
-    @wp.func_native(source(False, dtype))
-    def evaluate_rows(
-        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, elastic: int, scale: real, n: int, cached: int,
-        cache: wp.uint64, out: wp.uint64,
-    ): ...  # fmt: skip
+    @own.func_native(source(False, dtype))
+    def evaluate_rows(F, W0, W1, W2, elastic, scale, n, cached, cache, out): ...
 
-    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
-    def neural_vector_evaluate(
-        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, elastic: int, scale: real, n: int, cached: int,
-        cache: wp.uint64, out: wp.uint64,
-    ):  # fmt: skip
+    @own.kernel("unique", grid_stride=False)
+    def neural_vector_evaluate(F, W0, W1, W2, elastic, scale, n, cached, cache, out):
         evaluate_rows(F, W0, W1, W2, elastic, scale, n, cached, cache, out)
 
     return neural_vector_evaluate
@@ -115,31 +111,22 @@ def vjp_kernel(dtype: torch.dtype):
     If ``cached`` is 2, it reads the cache. If ``adds`` is 1, it adds to grad_F. It adds the gradients of the weights to
     the totals.
     """
-    real, _, _ = warp_types(dtype)
+    own = addressed(elastic=int, scale=warp_types(dtype)[0], n=int, cached=int, adds=int)
 
-    @wp.func_native(source(True, dtype))
+    @own.func_native(source(True, dtype))
     def vjp_rows(
-        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, elastic: int, scale: real, n: int, cached: int,
-        cache: wp.uint64, adds: int, grad_out: wp.uint64, grad_F: wp.uint64, total0: wp.uint64, total1: wp.uint64,
-        total2: wp.uint64,
-    ): ...  # fmt: skip
+        F, W0, W1, W2, elastic, scale, n, cached, cache, adds, grad_out, grad_F, total0, total1, total2
+    ): ...
 
-    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
+    @own.kernel("unique", grid_stride=False)
     def neural_vector_vjp(
-        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, elastic: int, scale: real, n: int, cached: int,
-        cache: wp.uint64, adds: int, grad_out: wp.uint64, grad_F: wp.uint64, total0: wp.uint64, total1: wp.uint64,
-        total2: wp.uint64,
-    ):  # fmt: skip
+        F, W0, W1, W2, elastic, scale, n, cached, cache, adds, grad_out, grad_F, total0, total1, total2
+    ):
         vjp_rows(
             F, W0, W1, W2, elastic, scale, n, cached, cache, adds, grad_out, grad_F, total0, total1, total2
         )  # fmt: skip
 
     return neural_vector_vjp
-
-
-def supported(device: torch.device, dtype: torch.dtype) -> bool:
-    """Whether these kernels run: on a CPU."""
-    return device.type == "cpu" and dtype in RANGE
 
 
 def kernel_of(

@@ -197,7 +197,6 @@ class _Pairs:
 class StructuredConstitutive(AdaptableConstitutive):
     """A network that corrects an analytic law. :mod:`structured_kernels` evaluates it, with `response` as reference."""
 
-    isotropic = True
     capturable = True
     native = True
     loops = True

@@ -118,7 +118,8 @@ class Simulation:
         self._segment_in_memory = 0
         self._weight_slices = weight_slices
         laws = [getattr(region.law, part) for region in regions for part in PARTS]
-        self._uses_graphs = x.device.type == "cuda" and all(law.capturable for law in laws)
+        single = x.dtype == torch.float32  # float64 on a GPU is for comparisons only
+        self._uses_graphs = x.device.type == "cuda" and single and all(law.capturable for law in laws)
         # No kernel adds the gradient of an analytic stress to that of another kind of return map.
         added = all(r.law.plasticity.native_rows or not r.law.elasticity.native_rows for r in regions)
         self._loops = bool(self.workspace.native) and added and all(law.loops for law in laws)

@@ -117,7 +117,7 @@ def compare(demo: DemoCapturesConfig, name: str, settings: Mapping[str, Any]) ->
     }
     row["scale_percent"], row["up_deg"] = errors["scale, from the cameras"], errors["up, from the cameras"]
     lenses = {group: read_lens(lens, "room.json") for group, lens in report["lenses"].items()}
-    longest = CaptureConfig().longest
+    longest = validate(CaptureConfig, {}).longest
     static = data / (PREFIX + name) / "static/transforms.json"
     if static.exists():
         rest = body_at_rest(demo, name)
