@@ -120,7 +120,9 @@ class Simulation:
         laws = [getattr(region.law, part) for region in regions for part in PARTS]
         single = x.dtype == torch.float32  # float64 on a GPU is for comparisons only
         self._uses_graphs = x.device.type == "cuda" and single and all(law.capturable for law in laws)
-        self._loops = self.workspace.native and all(law.loops for law in laws)
+        # No kernel adds the gradient of an analytic stress to that of another kind of return map.
+        added = all(r.law.plasticity.native_rows or not r.law.elasticity.native_rows for r in regions)
+        self._loops = bool(self.workspace.native) and added and all(law.loops for law in laws)
         self._loop: SegmentLoop | None = None
         self.errors: list[NonFiniteError | None] = [None] * copies
         self._graph_key = tuple((b.start, b.stop) for b in regions), tuple(law.graph_key() for law in laws)

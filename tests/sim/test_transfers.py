@@ -13,6 +13,7 @@ import torch
 
 from neuma_lib.errors import NonFiniteError
 from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.mechanics.law import Law
 from neuma_lib.mechanics.neural import neural_law
 from neuma_lib.mechanics.structured import structured_law
 from neuma_lib.sim import segment_loop, workspace
@@ -212,6 +213,25 @@ def test_segments_of_learned_laws_equal_steps_of_python(learned, monkeypatch):
     steps = grads()
     assert_near(steps[:2], expected[:2], 1e-13)
     assert_near(steps[2:], expected[2:], 1e-11)
+
+
+@pytest.mark.parametrize("elastic", ["von_mises", "networks", "structured"])
+@pytest.mark.parametrize("plastic", ["von_mises", "networks", "structured"])
+def test_parts_of_different_kinds(elastic, plastic, monkeypatch):
+    """A law whose parts are analytic, networks or structured moves as in steps of Python, with the same gradients."""
+    laws = {
+        "von_mises": make_law("von_mises"),
+        "networks": neural_law().double(),
+        "structured": structured_law(specification(plastic="von_mises"), dt=DT).double(),
+    }
+    law, start = Law(laws[elastic].elasticity, laws[plastic].plasticity), falling("particles")
+    looped = run(MODELS["particles"], law, start, (0, 3, 20))
+    monkeypatch.setattr(Simulation, "_make_loop", lambda *_: None)
+    monkeypatch.setattr(Simulation, "_loop", None, raising=False)
+    steps = run(MODELS["particles"], law, start, (0, 3, 20))
+    assert all(each.any() for each in looped[1])
+    assert_near(steps[0], looped[0], 1e-13)
+    assert_near(steps[1], looped[1], 1e-11)
 
 
 def test_gradients_of_constants(monkeypatch):
