@@ -21,7 +21,7 @@ from pathlib import Path
 
 import torch
 
-from benchmarks import torch_simulation
+from benchmarks import torch_rasterizer, torch_simulation
 from benchmarks.scene import SMALL, BenchmarkScene, Size, make_scene
 from benchmarks.timing import (
     arithmetic,
@@ -40,7 +40,6 @@ from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.simulation import Simulation, gather_weights
 from neuma_lib.sim.state import Trajectory
 from neuma_lib.sim.workspace import SORT_EVERY, free_pool
-from neuma_lib.splatting import torch_reference
 from neuma_lib.splatting.image_loss import mean_squared_error
 from neuma_lib.splatting.rasterizer import rasterize
 
@@ -247,7 +246,7 @@ def twin_render(device: torch.device) -> tuple[float, float]:
         image, _ = render(means, covars, *rest)
         torch.autograd.grad(image.square().mean(), means)
 
-    return tuple(seconds(lambda r=r: work(r), device, 2) for r in (torch_reference.rasterize, rasterize))
+    return tuple(seconds(lambda r=r: work(r), device, 2) for r in (torch_rasterizer.rasterize, rasterize))
 
 
 def main() -> None:

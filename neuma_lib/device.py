@@ -78,7 +78,7 @@ def typed(types: Mapping[str, Any]) -> SimpleNamespace:
     """Decorators of Warp that add the types of arguments without an annotation, by their names.
 
     Returns:
-        ``func``, ``func_native(source)``, and ``kernel(module)`` without automatic adjoints.
+        ``func``, ``func_native(source)``, and ``kernel(module, **options)`` without automatic adjoints.
     """
 
     def annotate(function: Callable) -> Callable:
@@ -91,8 +91,8 @@ def typed(types: Mapping[str, Any]) -> SimpleNamespace:
     return SimpleNamespace(
         func=lambda function: wp.func(annotate(function)),
         func_native=lambda source: lambda function: wp.func_native(source)(annotate(function)),
-        kernel=lambda module: (
-            lambda function: wp.kernel(annotate(function), enable_backward=False, module=module)
+        kernel=lambda module, **options: (
+            lambda function: wp.kernel(annotate(function), enable_backward=False, module=module, **options)
         ),
     )
 

@@ -120,7 +120,7 @@ def test_a_law_is_adapted_to_a_video(scene, analytic):
     """A neural law gets an adaptor, an analytic one a structured correction; the given law does not change."""
     if analytic:
         law = nm.Law.from_spec({"elasticity": {"name": "hencky", "E": 3e4, "nu": 0.35}})
-        options = {"iterations": 2, "trial_iterations": 2, "penalties": (), "covariance_from": "elastic"}
+        options = {"iterations": 2, "trial_iterations": 2, "covariance_from": "elastic"}
     else:
         law, options = neural_law(seed=0), {"rank": 4, "iterations": 3}
     before = {key: value.clone() for key, value in law.state_dict().items()}

@@ -53,8 +53,9 @@ def remake_deleted_folders(results: str) -> None:
 def start_local_jobs_at_once(workflow) -> None:
     """Remove the limit of 100 jobs a second from a local run, where the number of cores limits them already.
 
-    With a limit, Snakemake 9.27 selects jobs anew a second after each selection, and each job that ends begins another
-    such chain. After some hundred jobs it takes a core for itself and starts jobs late: on 64 cores, 28 of 64 ran.
+    With a limit, Snakemake 9.27 repeats each selection of jobs after a second, for as long as jobs are ready. Each job
+    that ends adds such a repetition. After some hundred jobs Snakemake takes a core for itself and starts jobs late: on
+    64 cores, 28 of 64 ran.
 
     Args:
         workflow: Snakemake's, when a run begins.

@@ -10,6 +10,7 @@ without a terminal, print a plain line every 15 seconds.
 from __future__ import annotations
 
 import fcntl
+import gc
 import logging
 import os
 import resource
@@ -81,6 +82,8 @@ def stage(name: str, log: str | Path | None = None, stream: TextIO | None = None
 
 def run_script(main: Callable, snakemake) -> None:
     """Run ``main(input, output, params, run)`` of a script as the stage of its rule and wildcards."""
+    gc.freeze()  # otherwise each collection, and the end of the process, visits all objects of the libraries
+    gc.enable()
     name = " ".join(filter(None, [snakemake.rule, "/".join(filter(None, snakemake.wildcards))]))
     started = _core_seconds()  # of the interpreter and all imports
     with stage(name, snakemake.log[0]) as run:

@@ -27,5 +27,3 @@ class StructuredConfig(Section):
     rivals: int = internal(
         1, "number of tied families with another return map that are corrected for comparison", ge=0
     )
-    # The largest that the held-out frames fit equally well is used.
-    penalties: tuple[float, ...] = internal((), "candidates for `training.penalty`")

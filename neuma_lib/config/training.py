@@ -46,10 +46,6 @@ class TrainingConfig(MotionOptions):
     warm_up: int = internal(5, "iterations in which the rates rise linearly from zero", ge=0)
     # A return to the best state halves the rates.
     recovery_growth: float = internal(1.1, "factor of halved rates for each accepted iteration", ge=1)
-    # The loss is divided by its first value. 0: none (paper).
-    penalty: float = internal(
-        0.0, "weight of the squared relative change of the law on unvisited states", ge=0
-    )
     diverged_ratio: float = internal(5.0, "multiple of the best loss that counts as diverged", gt=1)
     max_recoveries: int = internal(
         6, "maximum number of returns to the best state, then training is unstable", ge=0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from neuma_lib.coupling.binding import Binding
-from neuma_lib.coupling.deformation_kernels import PARTS, frame_kernels, kernels
+from neuma_lib.coupling.deformation_kernels import PARTS, kernels
 from neuma_lib.device import launch
 from neuma_lib.splatting.arrays import check_tensors
 
@@ -80,21 +80,13 @@ class _Deform(torch.autograd.Function):
     def forward(ctx, binding: Binding, means, covars, x0, arms, x, F):
         T, (G, N) = len(x), binding.shape
         moved, stretched = x.new_empty(T, G, 3), x.new_empty(T, G, 3, 3)
-        rows, needs_sums = binding.rows(x.dtype), ctx.needs_input_grad[6]
-        if x.device.type == "cpu":
-            sums = x.new_empty(T, G, 4 * PARTS) if needs_sums else None
-            launch(
-                frame_kernels(x.dtype).forward, T, *rows, means, covars, arms, x0, x.detach().contiguous(),
-                F.detach().contiguous(), x.new_empty(N, 4 * PARTS), sums, moved, stretched,
-            )  # fmt: skip
-        else:
-            run = kernels(x.dtype)
-            states, sums = x.new_empty(T, N * PARTS, 4), x.new_empty(T, G * PARTS, 4)
-            launch(run.pack, (T, N * PARTS), x0.view(-1), x.reshape(T, 3 * N), F.reshape(T, 9 * N), states)
-            launch(run.weighted_sums, (T, G * PARTS), *rows, states, PARTS, sums)
-            results = (moved.view(T, 3 * G), stretched.view(T, 3 * G, 3))
-            launch(run.carry, (T, 3 * G), means.view(-1), covars, arms, sums, *results)
-        ctx.save_for_backward(covars, arms, sums if needs_sums else None)
+        run = kernels(x.dtype)
+        states = torch.cat([x - x0, F.flatten(2)], dim=2).view(T, N * PARTS, 4)
+        sums = x.new_empty(T, G * PARTS, 4)
+        launch(run.weighted_sums, (T, G * PARTS), *binding.rows(x.dtype), states, PARTS, sums)
+        results = (moved.view(T, 3 * G), stretched.view(T, 3 * G, 3))
+        launch(run.carry, (T, 3 * G), means.view(-1), covars, arms, sums, *results)
+        ctx.save_for_backward(covars, arms, sums if ctx.needs_input_grad[6] else None)
         ctx.binding = binding
         return moved, stretched
 
@@ -106,18 +98,12 @@ class _Deform(torch.autograd.Function):
         parts = 1 if sums is None else PARTS
         incoming = (grad_moved.contiguous(), grad_stretched.contiguous())
         columns = ctx.binding.columns(grad_moved.dtype)
-        if grad_moved.device.type == "cpu":
-            grad_x = grad_moved.new_empty(T, N, 3)
-            grad_F = None if sums is None else grad_moved.new_empty(T, N, 3, 3)
-            run, scratch = frame_kernels(grad_moved.dtype), grad_moved.new_empty(G, 4 * parts)
-            launch(run.backward, T, *columns, covars, arms, sums, *incoming, scratch, grad_x, grad_F)
-        else:
-            run = kernels(grad_moved.dtype)
-            grad_sums = grad_moved.new_empty(T, G * parts, 4)
-            grad_states = grad_moved.new_empty(T, N * parts, 4)
-            launch(run.stretch_adjoint, (T, G), covars, arms, sums, *incoming, grad_sums)
-            launch(run.weighted_sums, (T, N * parts), *columns, grad_sums, parts, grad_states)
-            grad_states = grad_states.view(T, N, 4 * parts)
-            grad_x = grad_states[..., :3]
-            grad_F = None if sums is None else grad_states[..., 3:].unflatten(-1, (3, 3))
+        run = kernels(grad_moved.dtype)
+        grad_sums = grad_moved.new_empty(T, G * parts, 4)
+        grad_states = grad_moved.new_empty(T, N * parts, 4)
+        launch(run.stretch_adjoint, (T, G), covars, arms, sums, *incoming, grad_sums)
+        launch(run.weighted_sums, (T, N * parts), *columns, grad_sums, parts, grad_states)
+        grad_states = grad_states.view(T, N, 4 * parts)
+        grad_x = grad_states[..., :3]
+        grad_F = None if sums is None else grad_states[..., 3:].unflatten(-1, (3, 3))
         return None, None, None, None, None, grad_x, grad_F

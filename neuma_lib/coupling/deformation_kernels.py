@@ -4,9 +4,9 @@ particle.
 Both directions gather through a sparse matrix in CSR format, without atomic additions, so the result is deterministic.
 Both sum rows of twelve contiguous numbers, a vector and a matrix (the vector and a zero if F needs no gradient).
 
-On a CPU one native loop per frame packs, sums and deforms. On a GPU a thread sums four columns. Memory accesses are
-coalesced: neighbouring threads read one row, 16 bytes each in float32, and write neighbouring results. Frames are the
-slow index, so the rows of a frame stay in the cache while all its Gaussians read them, about seven times each.
+A thread sums four columns. Memory accesses of a GPU are coalesced: neighbouring threads read one row, 16 bytes each in
+float32, and write neighbouring results. Frames are the slow index, so the rows of a frame stay in the cache while all
+its Gaussians read them, about seven times each.
 """
 
 # No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
@@ -16,7 +16,7 @@ from types import SimpleNamespace
 import torch
 import warp as wp
 
-from neuma_lib.device import native_source, start_warp, typed
+from neuma_lib.device import native_source, start_warp
 from neuma_lib.mechanics.singular_values_kernels import warp_types
 
 start_warp()
@@ -26,73 +26,9 @@ PARTS = 3
 
 
 @functools.cache
-def frame_kernels(dtype: torch.dtype) -> SimpleNamespace:
-    """Kernels ``forward`` and ``backward`` of a dtype on a CPU, over frames, which run one after the other."""
-    real, _, _ = warp_types(dtype)
-    module = wp.get_module(f"{__name__}.frames.{str(dtype).removeprefix('torch.')}")
-    text = native_source(__file__, ".h")
-    start = text["frames"].replace("REAL", {torch.float32: "float", torch.float64: "double"}[dtype])
-
-    types = {
-        **dict.fromkeys(("frame", "count", "particles"), int),
-        "indptr": wp.array(dtype=int),  # rows of B, (G + 1,), in `backward` of B^T, (N + 1,)
-        "indices": wp.array(dtype=int),
-        "weights": wp.array(dtype=real),
-        "means": wp.array2d(dtype=real),  # (G, 3)
-        "covars": wp.array3d(dtype=real),  # (G, 3, 3)
-        "arms": wp.array2d(dtype=real),  # (G, 3) or None
-        "x0": wp.array2d(dtype=real),  # (N, 3)
-        "x": wp.array3d(dtype=real),  # (T, N, 3)
-        "F": wp.array4d(dtype=real),  # (T, N, 3, 3)
-        "scratch": wp.array2d(dtype=real),  # (N, 12); in `backward` (G, 12), or (G, 4) if F needs no gradient
-        "sums": wp.array3d(
-            dtype=real
-        ),  # (T, G, 12), out: mean shift and mean F of the particles; None without them
-        "moved": wp.array3d(dtype=real),  # (T, G, 3), out
-        "stretched": wp.array4d(dtype=real),  # (T, G, 3, 3), out
-        "grad_moved": wp.array3d(dtype=real),  # (T, G, 3)
-        "grad_stretched": wp.array4d(dtype=real),  # (T, G, 3, 3)
-        "grad_x": wp.array3d(dtype=real),  # (T, N, 3), out
-        "grad_F": wp.array4d(dtype=real),  # (T, N, 3, 3), out; None if F needs no gradient, as `sums` then
-    }
-    own = typed(types)
-    kernel = own.kernel(module)
-
-    @own.func_native(start + text["forward"])
-    def forward_native(
-        frame, count, particles, indptr, indices, weights, means, covars, arms, x0, x, F, scratch, sums, moved,
-        stretched,
-    ): ...  # fmt: skip
-
-    @own.func_native(start + text["backward"])
-    def backward_native(
-        frame, count, particles, indptr, indices, weights, covars, arms, sums, grad_moved, grad_stretched, scratch,
-        grad_x, grad_F,
-    ): ...  # fmt: skip
-
-    @kernel
-    def forward(indptr, indices, weights, means, covars, arms, x0, x, F, scratch, sums, moved, stretched):
-        forward_native(
-            wp.tid(), moved.shape[1], x0.shape[0], indptr, indices, weights, means, covars, arms, x0, x, F, scratch,
-            sums, moved, stretched,
-        )  # fmt: skip
-
-    @kernel
-    def backward(
-        indptr, indices, weights, covars, arms, sums, grad_moved, grad_stretched, scratch, grad_x, grad_F
-    ):
-        backward_native(
-            wp.tid(), grad_moved.shape[1], grad_x.shape[1], indptr, indices, weights, covars, arms, sums, grad_moved,
-            grad_stretched, scratch, grad_x, grad_F,
-        )  # fmt: skip
-
-    return SimpleNamespace(forward=forward, backward=backward)
-
-
-@functools.cache
 def kernels(dtype: torch.dtype) -> SimpleNamespace:
-    """Kernels for a dtype on a GPU. A thread processes one frame and: a part of a row (`pack`, `weighted_sums`), a
-    coordinate of a Gaussian (`carry`), or a Gaussian (`stretch_adjoint`).
+    """Kernels for a dtype. A thread processes one frame and: a part of a row (`weighted_sums`), a coordinate of a
+    Gaussian (`carry`), or a Gaussian (`stretch_adjoint`).
     """
     real, vec3, mat33 = warp_types(dtype)
     vec4 = wp.types.vector(length=4, dtype=real)
@@ -123,25 +59,6 @@ def kernels(dtype: torch.dtype) -> SimpleNamespace:
     @wp.func
     def one_of(i: wp.int32, a: real, b: real, c: real):
         return wp.where(i == 0, a, wp.where(i == 1, b, c))
-
-    @kernel
-    def pack(
-        x0: wp.array(dtype=real),  # (3 N,)
-        x: wp.array2d(dtype=real),  # (T, 3 N)
-        F: wp.array2d(dtype=real),  # (T, 9 N)
-        rows: wp.array2d(dtype=vec4),  # (T, 3 N), out: x - x0 and F of each particle
-    ):
-        t, place = wp.tid()
-        j = place // PARTS
-        part = place - j * PARTS
-        value = vec4()
-        for k in range(4):
-            column = 4 * part + k
-            if column < 3:
-                value[k] = x[t, 3 * j + column] - x0[3 * j + column]
-            else:
-                value[k] = F[t, 9 * j + column - 3]
-        put(rows, t, place, value)
 
     @kernel
     def weighted_sums(
@@ -203,6 +120,4 @@ def kernels(dtype: torch.dtype) -> SimpleNamespace:
         else:
             put(grad_sums, t, g, vec4(shift[0], shift[1], shift[2], real(0.0)))
 
-    return SimpleNamespace(
-        pack=pack, weighted_sums=weighted_sums, carry=carry, stretch_adjoint=stretch_adjoint
-    )
+    return SimpleNamespace(weighted_sums=weighted_sums, carry=carry, stretch_adjoint=stretch_adjoint)

@@ -11,8 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
-from scipy.special import chdtri
 from torch import Tensor
 
 from neuma_lib.config.binding import BindingConfig
@@ -193,6 +191,8 @@ class _Ellipsoids(NamedTuple):
 
     @classmethod
     def of(cls, centres: Tensor, shapes: Tensor, settings: BindingConfig) -> _Ellipsoids:
+        from scipy.special import chdtri  # here, because the import takes an eighth of a second
+
         eigenvalues, eigenvectors = np.linalg.eigh(shapes.cpu().numpy())
         largest = eigenvalues[:, 2]
         if not (largest > 0).all():
@@ -254,6 +254,8 @@ def _share_volumes(points: np.ndarray, volumes: np.ndarray, added: np.ndarray) -
     ``sum_j f_mj p_j = q`` (the f of minimum norm, which has negative entries if q is outside its neighbours). w_m is an
     equal share among the group, reduced so that no particle gives more than ``_MAX_SHARE`` of its volume.
     """
+    from scipy.spatial import cKDTree
+
     size = min(_SHARING_NEIGHBOURS, len(points))
     tree = cKDTree(points, balanced_tree=False, compact_nodes=False)  # faster to build, for few queries
     _, neighbours = tree.query(added, k=np.arange(1, size + 1))

@@ -29,7 +29,6 @@ from neuma_lib.config.training import TrainingConfig
 from neuma_lib.coupling.filmed import Filmed
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError, NonFiniteError
-from neuma_lib.fitting.deviation import Deviation
 from neuma_lib.fitting.frame_batches import evaluate_in_batches
 from neuma_lib.fitting.training_loop import TrainingLoop
 from neuma_lib.geometry.chamfer import chamfer_loss
@@ -322,11 +321,6 @@ class _Loop(TrainingLoop):
             if parameter.requires_grad and name in memory["averages"]:
                 self.optimizer.state[parameter] = copy.deepcopy(memory["averages"][name])
         self._begin(History(), memory["first_loss"])
-        self.deviation = None
-        if settings.penalty:
-            with torch.no_grad():  # with the initial law, before a checkpoint is loaded
-                paths = [self._path(start, loss) for start, loss in self.videos]
-                self.deviation = Deviation.of_videos(law, paths, model.dt)
 
     def advance(self) -> None:
         started = time.perf_counter()
@@ -360,12 +354,8 @@ class _Loop(TrainingLoop):
         return _mean(self._frame_losses())
 
     def _frame_losses(self) -> list[Tensor]:
-        """Losses of the frames of every video, shape (T,) each, plus the penalty in units of the first loss."""
-        losses = [loss(self._path(start, loss)) for start, loss in self.videos]
-        if self.deviation is None or self.first_loss is None:
-            return losses
-        added = self.settings.penalty * self.first_loss * self.deviation()
-        return [frames + added for frames in losses]
+        """Losses of the frames of every video, shape (T,) each."""
+        return [loss(self._path(start, loss)) for start, loss in self.videos]
 
     def _path(self, start: State, loss: TrajectoryLoss) -> Trajectory:
         memory = None if self.settings.memory is None else self.settings.memory * 2**30 / len(self.videos)

@@ -34,15 +34,17 @@ Array = NDArray[np.float64]
 GRAVITY = 9.81
 """[m/s^2]"""
 ROTATION, TRANSLATION, PLACEMENT = slice(0, 3), slice(3, 6), slice(6, 9)
-RATIO, HELD, RELEASE = 9, 10, 11
-CENTRE = slice(12, 14)
+RATIO, HELD, RELEASE, RETARDATION = range(9, 13)
+CENTRE = slice(13, 15)
 """Unknowns: changes of the camera's pose and of the placement, of log(mu / rho), of the share of the weight that is
-held, of the time of release, and of the principal point of a second camera."""
-UNKNOWNS = 14
+held, of the time of release, of the logarithm of the retardation time, and of the principal point of a second camera.
+"""
+UNKNOWNS = 15
 _SCALES = np.array(
-    [0.1] * 3 + [0.01] * 3 + [1.0] * 3 + [0.1, 0.03, 5e-3, 5.0, 5.0]
-)  # rad, m, (prior), 1, 1, s, px
-_SHAPE = slice(9, 12)
+    [0.1] * 3 + [0.01] * 3 + [1.0] * 3 + [0.1, 0.03, 5e-3, 0.3, 5.0, 5.0]
+)  # rad, m, (prior), 1, 1, s, 1, px
+_SHAPE = slice(9, 13)
+_OF_LOGARITHM = np.array([True, False, False, True])  # numbers of the shape
 _CONTOUR_NOISE, _CORRELATED = (
     2.0,
     30.0,
@@ -99,8 +101,8 @@ def _sampled(mask: NDArray[np.bool_], points: Array) -> NDArray[np.bool_]:
 
 
 class ClampedBody(Protocol):
-    """A body whose surface depends on three numbers: mu / rho [m^2/s^2], the share of its weight that is held before a
-    release, and the time of the release [s]."""
+    """A body whose surface depends on four numbers: mu / rho [m^2/s^2], the share of its weight that is held before a
+    release, the time of the release [s], and its retardation time, viscosity / mu [s]."""
 
     @property
     def triangles(self) -> NDArray[np.int64]:
@@ -122,7 +124,8 @@ class ClampedBody(Protocol):
         ...
 
     def derivatives(self, shape: Array, free: Sequence[int]) -> Array:
-        """Their derivatives by log(mu / rho), share and time (3, P, 3). Those by others than ``free`` may be 0."""
+        """Their derivatives by log(mu / rho), share, time and logarithm of the retardation time (4, P, 3). Those by
+        others than ``free`` may be 0."""
         ...
 
 
@@ -206,7 +209,7 @@ class RestingBody:
         ratio, share = map(float, shape[:2])
         rest = self.at_rest(ratio, share)
         held = rest.response(self.holding_forces(ratio)) if HELD in free else np.zeros_like(rest.x)
-        bends = (rest.by_stiffness, held, np.zeros_like(rest.x))
+        bends = (rest.by_stiffness, held, *np.zeros((2, *rest.x.shape)))
         return np.stack([self.weights @ bend for bend in bends])
 
 
@@ -217,9 +220,10 @@ class StillFit:
     Attributes:
         pose: marker to camera, shape (4, 4).
         placement: origin of the body's frame in the marker's frame [m], shape (3,).
-        shape: mu / rho [m^2/s^2], the share of the weight that is held, and the time of release [s].
-        shape_std: standard deviations, of the first of its logarithm, from noise and placement, with residuals of the
-            silhouette that are correlated over 30 px, and enlarged where they exceed the assumed noise; 0 if given.
+        shape: numbers of `ClampedBody`.
+        shape_std: standard deviations, of the first and last of their logarithms, from noise and placement, with
+            residuals of the silhouette that are correlated over 30 px, and enlarged where they exceed the assumed
+            noise; 0 if given.
         centre: change of the principal point [px].
         placement_std: of the placement [m], shape (3,).
         contour_rms: root mean square distance of the visible observed silhouette from the outline [px].
@@ -232,8 +236,8 @@ class StillFit:
 
     pose: Array
     placement: Array
-    shape: tuple[float, float, float]
-    shape_std: tuple[float, float, float]
+    shape: tuple[float, ...]
+    shape_std: tuple[float, ...]
     centre: tuple[float, float]
     placement_std: Array
     contour_rms: float
@@ -257,7 +261,7 @@ class StillFit:
 class StillResiduals:
     """Residuals of a still in units of standard deviations, for `levenberg_marquardt`.
 
-    Unknowns u (14,) are changes in units of `_SCALES`: of the camera's rotation and translation, of the placement in
+    Unknowns u (15,) are changes in units of `_SCALES`: of the camera's rotation and translation, of the placement in
     standard deviations of its prior, of the numbers of the body's shape, and of the principal point.
 
     Args:
@@ -279,7 +283,7 @@ class StillResiduals:
         centre: tuple[float, float] | None = None,
     ):
         self.still, self.body = still, body
-        self.start = pose, placement, np.array([*shape, 0.0, 0.0][:3]), np.array(centre or (0.0, 0.0))
+        self.start = pose, placement, np.array([*shape, 0.0, 0.0, 0.0][:4]), np.array(centre or (0.0, 0.0))
         self.scales = _SCALES.copy()
         self.scales[PLACEMENT] *= placement_std
         self.scales[CENTRE] *= centre is not None
@@ -289,13 +293,13 @@ class StillResiduals:
         self.visible = np.ones(len(self.contour), dtype=bool)
 
     def values(self, u: Array) -> tuple[Array, Array, Array, Array]:
-        """Pose (4, 4), placement (3,), numbers of the shape (3,) and change of the principal point (2,) of unknowns."""
+        """Pose (4, 4), placement (3,), numbers of the shape (4,) and change of the principal point (2,) of unknowns."""
         pose, placement, shape, centre = self.start
         change = self.scales * u
         pose = pose.copy()
         pose[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec(change[ROTATION]).as_matrix()
         pose[:3, 3] += change[TRANSLATION]
-        shape = np.array([shape[0] * np.exp(change[RATIO]), *(shape + change[_SHAPE])[1:]])
+        shape = np.where(_OF_LOGARITHM, shape * np.exp(change[_SHAPE]), shape + change[_SHAPE])
         return pose, placement + change[PLACEMENT], shape, centre + change[CENTRE]
 
     def _project(self, u: Array, points: Array) -> tuple[Array, Array]:
@@ -342,11 +346,11 @@ class StillResiduals:
         return np.linalg.norm(self._distances(self.surface(u)[1])[3], axis=1)
 
     def _corners(self, u: Array) -> tuple[Array, Array]:
-        """Residuals of the marker's corners (2 M,) and their derivatives by the unknowns (2 M, 14)."""
+        """Residuals of the marker's corners (2 M,) and their derivatives by the unknowns (2 M, 15)."""
         pixels, slopes = self._project(u, self.still.marker)
         J = np.zeros((2 * len(pixels), UNKNOWNS))
         self._by_pose(J, u, self.still.marker, slopes.reshape(-1, 3))
-        J.reshape(-1, 2, UNKNOWNS)[:, (0, 1), (12, 13)] = self.scales[CENTRE]
+        J.reshape(-1, 2, UNKNOWNS)[:, :, CENTRE] = np.diag(self.scales[CENTRE])
         return (pixels - self.still.marker_pixels).ravel() / _MARKER_NOISE, J / _MARKER_NOISE
 
     def _by_pose(self, J: Array, u: Array, points: Array, slopes: Array) -> None:

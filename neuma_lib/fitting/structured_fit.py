@@ -8,9 +8,6 @@ the law. They are excluded, and the steps up to the contact are simulated once w
 
 A correction cannot change the kind of its base: an elastic base never flows, and a fluid base carries no static load.
 If the constants alone do not distinguish such families, corrections of rivals are compared in the same way.
-
-The weight of the penalty on unvisited states (`neuma_lib.fitting.deviation`) is selected by the same frames: the
-largest of the given weights with a similar held-out loss.
 """
 
 from __future__ import annotations
@@ -42,8 +39,6 @@ NOTHING = "nothing"
 """Name of the selection without parts."""
 PARTS = {"elastic": "elasticity", "plastic": "plasticity"}
 """Parts of a law by their short names."""
-TOLERANCE = 0.01
-"""Relative increase of the held-out loss that is accepted for a larger weight of the penalty."""
 MIN_FRAMES = 4
 """Minimum number of frames for fit and evaluation."""
 
@@ -68,16 +63,14 @@ class Selection:
     Attributes:
         parts: short names of the corrected parts, empty if the law is unchanged.
         base: index of the corrected law: 0, or k for the k-th rival.
-        trials: scores by names of the parts joined with " + ", with the penalty if it was varied, and of `NOTHING`.
-            Names of the k-th rival have the prefix "rival k: ".
+        trials: scores by names of the parts joined with " + ", and of `NOTHING`. Names of the k-th rival have the
+            prefix "rival k: ".
         held_out_frames: steps of the held-out frames, one tuple per video.
-        penalty: weight of the penalty on unvisited states.
     """
 
     parts: tuple[str, ...]
     trials: dict[str, Score]
     held_out_frames: tuple[tuple[int, ...], ...]
-    penalty: float = 0.0
     base: int = 0
 
     def as_dict(self) -> dict[str, Any]:
@@ -87,7 +80,7 @@ class Selection:
             for name, losses in _plain(self.trials).items()
         }
         held_out = [list(frames) for frames in self.held_out_frames]
-        about = {"corrected_parts": list(self.parts), "base": self.base, "penalty": self.penalty}
+        about = {"corrected_parts": list(self.parts), "base": self.base}
         return {**about, "trials": trials, "held_out_frames": held_out}
 
     def summary(self) -> str:
@@ -98,8 +91,7 @@ class Selection:
             for name, score in self.trials.items()
             if name != NOTHING
         ]
-        penalty = f", penalty {self.penalty:g}" if self.penalty else ""
-        return f"corrected: {_name(self.base, self.parts)}{penalty}; change of the held-out loss: {', '.join(changes)}"
+        return f"corrected: {_name(self.base, self.parts)}; change of the held-out loss: {', '.join(changes)}"
 
 
 def train_structured(
@@ -161,8 +153,7 @@ def train_structured(
     training = [(start, loss.select(keep)) for keep, (start, loss) in zip(fitted, informative, strict=True)]
     brief = settings.model_copy(update={"iterations": structured.trial_iterations})
     first = Stretch(after=settings.iterations)
-    weights = [weight for weight in structured.penalties if weight != settings.penalty]
-    total = (len(laws) + len(weights)) * brief.iterations + settings.iterations
+    total = len(laws) * brief.iterations + settings.iterations
     saved = checkpoint.load() if checkpoint else None
     trials = {name: Score(**losses) for name, losses in saved["trials"].items()} if saved else {}
     states = dict(saved["states"]) if saved else {}
@@ -184,11 +175,6 @@ def train_structured(
         overall = progress and (lambda done, _, value: progress(before + done, total, value))
         options = {"other_videos": videos[1:], "checkpoint": inner, "progress": overall, "log": log}
         return train_material(model, law, *videos[0], settings, stretch=stretch, **options)
-
-    def keep(base: int, weight: float, trained: TrainedMaterial) -> LawState:
-        state = {"law": copy.deepcopy(trained.law.state_dict()), "memory": trained.memory}
-        states[base, weight] = state
-        return state["law"]
 
     def evaluate(name: str, base: int, state: LawState) -> None:
         """Store the score of a law on the informative frames."""
@@ -213,33 +199,21 @@ def train_structured(
             continue
         done = base * brief.iterations
         trained = train(base, uncorrected[base], trained_parts(each), training, brief, first, done)
-        together = keep(base, settings.penalty, trained)
+        states[base] = {"law": copy.deepcopy(trained.law.state_dict()), "memory": trained.memory}
         if base == 0:
             evaluate(NOTHING, 0, uncorrected[0])
         for parts in of_base:
-            evaluate(_name(base, parts), base, corrected_in(parts, together, uncorrected[base]))
+            evaluate(_name(base, parts), base, corrected_in(parts, states[base]["law"], uncorrected[base]))
     base, parts = _select(candidates, trials, structured.margin)
     steps = tuple(
         tuple(loss.frames[begin + k] for k in out)
         for begin, out, (_, loss) in zip(firsts, held_out, videos, strict=True)
     )
-    selection = Selection(parts, trials, steps, settings.penalty, base)
+    selection = Selection(parts, trials, steps, base)
     if parts:
-        name = _name(base, parts)
-        losses = {settings.penalty: trials[name].held_out_loss}
-        for k, weight in enumerate(weights, len(laws)):
-            penalised = f"{name}, penalty {weight:g}"
-            if penalised not in trials:
-                varied = brief.model_copy(update={"penalty": weight})
-                trained = train(base, uncorrected[base], parts, training, varied, first, k * brief.iterations)
-                evaluate(penalised, base, keep(base, weight, trained))
-            losses[weight] = trials[penalised].held_out_loss
-        selection.penalty = largest_similar(losses)
-        varied = settings.model_copy(update={"penalty": selection.penalty})
-        state = states[base, selection.penalty]
-        begin = corrected_in(parts, state["law"], uncorrected[base])
-        last = Stretch(before=brief.iterations, memory=state["memory"])
-        return train(base, begin, parts, informative, varied, last, total - settings.iterations), selection
+        begin = corrected_in(parts, states[base]["law"], uncorrected[base])
+        last = Stretch(before=brief.iterations, memory=states[base]["memory"])
+        return train(base, begin, parts, informative, settings, last, total - settings.iterations), selection
     law.load_state_dict(uncorrected[0])
     value = _mean([_mean(losses[begin:]) for begin, (_, losses) in zip(firsts, simulated, strict=True)])
     return TrainedMaterial(law, History(loss=[value]), value, 0, stable=True), selection
@@ -323,11 +297,6 @@ def _flow(law: Mapping[str, Any]) -> str:
     return law["plasticity"]["name"]
 
 
-def largest_similar(losses: dict[float, float]) -> float:
-    """The largest weight whose held-out loss exceeds the lowest one by at most `TOLERANCE`."""
-    return max(w for w, loss in losses.items() if loss <= (1 + TOLERANCE) * min(losses.values()))
-
-
 def _simulate(
     model: MPM, law: StructuredLaw, start: State, loss: TrajectoryLoss
 ) -> tuple[Trajectory, list[float]] | None:
@@ -359,12 +328,12 @@ class _Stage:
 
     Attributes:
         trials: scores of finished trials.
-        states: trained laws and the memory of their trainings by base and weight of the penalty.
+        states: trained laws and the memory of their trainings by base.
     """
 
     whole: Checkpoint
     trials: dict[str, dict[str, float]]
-    states: dict[tuple[int, float], dict[str, Any]]
+    states: dict[int, dict[str, Any]]
 
     def load(self) -> dict[str, Any] | None:
         """The state of this training, or None if the checkpoint belongs to another."""

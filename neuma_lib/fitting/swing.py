@@ -1,17 +1,19 @@
-"""Silhouettes of a body that is held and released: a prediction from mu / rho of the hanging body, and an own fit.
+"""Silhouettes of a body that is held and released: a prediction from mu / rho of the hanging body, and own fits.
 
 Unknown in addition to those of a body at rest (`neuma_lib.fitting.resting`) are the share of the weight that held the
 body, the time of release, and the principal point of the camera that filmed the motion. A still of the held body, with
 the marker, shares pose, placement and share. So it determines them almost alone.
 
 The body starts in equilibrium with what holds it, on the mesh of quadratic elements, and moves as particles
-(`neuma_lib.coupling.specimens`). The law is elastic.
+(`neuma_lib.coupling.specimens`). The law is elastic, or a Kelvin-Voigt solid whose retardation time, viscosity / mu, is
+fitted. A vibration of angular frequency w then has a damping ratio of w / 2 times that time, and the simulation's own.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -26,8 +28,10 @@ from neuma_lib.coupling.specimens import clamped_body, released
 from neuma_lib.fitting.resting import (
     CENTRE,
     HELD,
+    PLACEMENT,
     RATIO,
     RELEASE,
+    RETARDATION,
     UNKNOWNS,
     RestingBody,
     StillFit,
@@ -36,8 +40,10 @@ from neuma_lib.fitting.resting import (
     contours,
     total_cost,
 )
-from neuma_lib.fitting.resting_records import Progress, resting_body, resting_law
+from neuma_lib.fitting.resting_records import Progress, over_clamps, resting_body, resting_law
+from neuma_lib.fitting.vibration import Vibration, fit_vibration
 from neuma_lib.io.datasets.stills import Still
+from neuma_lib.sim.equilibrium import extrapolated
 
 Array = NDArray[np.float64]
 
@@ -47,8 +53,13 @@ FIRST_SHARE = 0.6
 """Share of the weight that is held, before the fit."""
 FIRST_RELEASES = (0.0, 0.03, 0.06)
 """Times of release after the first photograph before the fit [s], of which the best is the start."""
+FIRST_RETARDATION = 5e-3
+"""Retardation time before it is fitted [s]."""
+FITS = {"predicted": (), "fitted": (RATIO,)}
+"""Results of a swing on each grid, and the numbers of the shape that each fits in addition to share and release."""
 _NEIGHBOURS = 40  # particles whose affine motion a point of the surface follows
-_DIFFERENCE = 0.02  # of log(mu / rho), and of the share
+_DIFFERENCES = {RATIO: 0.02, HELD: 0.02, RETARDATION: 0.2}  # of logarithms, and of the share
+_VIBRATION = 4.0  # simulated time for the damping, in durations of the swing
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +68,7 @@ class Swing:
 
     Attributes:
         resting: the body before the release, with its region `held`.
-        spec: its law as plain values.
+        spec: its elastic law as plain values.
         dx: edge of a cell [m].
         duration: simulated time after the release [s].
     """
@@ -68,21 +79,23 @@ class Swing:
     duration: float
     _paths: dict = field(default_factory=dict)
 
-    def path(self, ratio: float, share: float) -> CubicSpline:
+    def path(self, ratio: float, share: float, retardation: float = 0.0) -> CubicSpline:
         """Function from the time after the release [s] to points of the surface (P, 3) [m] in the body's frame."""
-        key = round(ratio, 9), round(share, 9)
+        key = round(ratio, 9), round(share, 9), round(retardation, 12)
         if key not in self._paths:
             if len(self._paths) > 8:
                 self._paths.pop(next(iter(self._paths)))
-            self._paths[key] = self._simulated(ratio, share)
+            self._paths[key] = self._simulated(ratio, share, retardation)
         return self._paths[key]
 
-    def _simulated(self, ratio: float, share: float) -> CubicSpline:
-        body = self.resting
+    def _simulated(self, ratio: float, share: float, retardation: float) -> CubicSpline:
+        body, spec = self.resting, dict(self.spec)
+        if retardation:
+            spec["viscosity"] = {"name": "kelvin_voigt", "viscosity": retardation * body.shear_modulus}
         held = body.body, body.at_rest(ratio, share)
         density, clamp = body.shear_modulus / ratio, body.clamps[0]
-        specimen = clamped_body(body.body, clamp, density, body.gravity, self.spec, self.dx, held=held)
-        times, x = released(specimen, specimen.law(self.spec), self.duration, FRAME)
+        specimen = clamped_body(body.body, clamp, density, body.gravity, spec, self.dx, held=held)
+        times, x = released(specimen, specimen.law(spec), self.duration, FRAME)
         points, _ = Interpolation(torch.from_numpy(body.undeformed), specimen.places, _NEIGHBOURS)(x)
         return CubicSpline(times, points.numpy())
 
@@ -110,20 +123,25 @@ class SwingingBody:
         return float(np.clip(self.time - release, 0.0, self.swing.duration))
 
     def positions(self, shape: Array) -> Array:
-        ratio, share, release = map(float, shape)
-        return self.swing.path(ratio, share)(self._elapsed(release))
+        ratio, share, release, retardation = map(float, shape)
+        return self.swing.path(ratio, share, retardation)(self._elapsed(release))
 
     def derivatives(self, shape: Array, free: Sequence[int]) -> Array:
-        ratio, share, release = map(float, shape)
-        path, elapsed = self.swing.path(ratio, share), self._elapsed(release)
+        ratio, share, release, retardation = map(float, shape)
+        elapsed, h = self._elapsed(release), _DIFFERENCES
+        others = {
+            RATIO: (ratio * np.exp(h[RATIO]), share, retardation),
+            HELD: (ratio, share + h[HELD], retardation),
+            RETARDATION: (ratio, share, retardation * np.exp(h[RETARDATION])),
+        }
+        path = self.swing.path(ratio, share, retardation)
         here = path(elapsed)
-        result = np.zeros((3, *here.shape))
-        if RATIO in free:
-            result[0] = (self.swing.path(ratio * np.exp(_DIFFERENCE), share)(elapsed) - here) / _DIFFERENCE
-        if HELD in free:
-            result[1] = (self.swing.path(ratio, share + _DIFFERENCE)(elapsed) - here) / _DIFFERENCE
+        result = np.zeros((len(shape), *here.shape))
+        for k, other in others.items():
+            if k in free:
+                result[k - RATIO] = (self.swing.path(*other)(elapsed) - here) / h[k]
         if 0 < self.time - release < self.swing.duration:
-            result[2] = -path(elapsed, 1)
+            result[RELEASE - RATIO] = -path(elapsed, 1)
         return result
 
 
@@ -155,6 +173,8 @@ class SwingFit:
             "share": first.shape[1],
             "release": first.shape[2],
             "release_std": first.shape_std[2],
+            "retardation": first.shape[3],
+            "retardation_log_std": first.shape_std[3],
             "centre": list(first.centre),
             "sag": self.sag,
             "placement": first.placement.tolist(),
@@ -175,10 +195,11 @@ def fit_swing(
     placement: Array,
     placement_std: float,
     ratio: float,
-    fixed_ratio: bool,
+    fitted: Sequence[int] = (),
+    before: SwingFit | None = None,
     iterations: int = 12,
 ) -> SwingFit:
-    """Fit everything but mu / rho, or mu / rho as well.
+    """Fit pose, placement, share, release and principal point, and those of mu / rho and retardation that are listed.
 
     The still of the held body is fitted first. Time of release and principal point follow from the frames, and then all
     unknowns from all pictures.
@@ -187,45 +208,64 @@ def fit_swing(
         held: still of the held body with the marker, by the first camera.
         frames: silhouettes of the motion.
         times: of the frames [s].
-        poses, placement, placement_std, ratio, fixed_ratio: as in `fitting.resting.fit_still`.
+        poses, placement, placement_std, ratio: as in `fitting.resting.fit_still`.
+        fitted: of `RATIO` and `RETARDATION`. A body whose retardation has not been fitted is elastic.
+        before: another fit of the same pictures, from which this one starts.
     """
-    body = swing.resting
-    alone = [
-        Stills([StillResiduals(held, body, pose, placement, placement_std, ratio, FIRST_SHARE)])
-        for pose in poses
-    ]
-    first = [*range(9), HELD]
-    starts = [(problem, *problem.minimise(np.zeros(UNKNOWNS), first, 30)) for problem in alone]
-    problem, u, _ = min(starts, key=lambda each: total_cost(*each[1:]))
-    pose, found, shape, _ = problem.parts[0].values(u)
-    fits = []
-    for release in FIRST_RELEASES:
-        own = ratio, float(shape[1]), release
-        parts = [StillResiduals(held, body, pose, placement, placement_std, *own)]
-        parts += [
-            StillResiduals(
-                frame, SwingingBody(swing, time), pose, placement, placement_std, *own, centre=(0.0, 0.0)
+    body, prior = swing.resting, (placement, placement_std)
+    first = FIRST_RETARDATION * (RETARDATION in fitted)
+
+    def joint(pose: Array, found: Array, shape: Sequence[float], centre: tuple[float, float]):
+        """All pictures, and unknowns with a placement."""
+        parts = [StillResiduals(held, body, pose, *prior, *shape)]
+        for frame, time in zip(frames, times, strict=True):
+            parts.append(
+                StillResiduals(frame, SwingingBody(swing, time), pose, *prior, *shape, centre=centre)
             )
-            for frame, time in zip(frames, times, strict=True)
-        ]
-        start = np.zeros(UNKNOWNS)
-        start[6:9] = (found - placement) / placement_std
-        joint = Stills(parts)
-        fits.append((joint, *joint.minimise(start, [RELEASE, *range(UNKNOWNS)[CENTRE]], iterations)))
-    joint, u, _ = min(fits, key=lambda each: total_cost(*each[1:]))
-    free = [*range(9), HELD, RELEASE, *range(UNKNOWNS)[CENTRE], *([] if fixed_ratio else [RATIO])]
-    u, fit = joint.minimise(u, free, iterations, min_gain=1e-3)
-    before, *during = joint.results(u, fit, free)
-    return SwingFit(before, during, sag(body, before.shape))
+        u = np.zeros(UNKNOWNS)
+        u[PLACEMENT] = (found - placement) / placement_std
+        return Stills(parts), u
+
+    if before is None:
+        alone = [Stills([StillResiduals(held, body, pose, *prior, ratio, FIRST_SHARE)]) for pose in poses]
+        own = [*range(9), HELD]
+        fits = [(problem, *problem.minimise(np.zeros(UNKNOWNS), own, 30)) for problem in alone]
+        problem, u, _ = min(fits, key=lambda each: total_cost(*each[1:]))
+        pose, found, shape, _ = problem.parts[0].values(u)
+        starts = [joint(pose, found, (ratio, shape[1], t, first), (0.0, 0.0)) for t in FIRST_RELEASES]
+        own = [RELEASE, *range(UNKNOWNS)[CENTRE]]
+        fits = [(problem, *problem.minimise(u, own, iterations)) for problem, u in starts]
+        problem, u, _ = min(fits, key=lambda each: total_cost(*each[1:]))
+    else:
+        last = before.frames[0]
+        shape = *last.shape[:3], last.shape[3] or first
+        problem, u = joint(last.pose, last.placement, shape, last.centre)
+    free = [*range(9), HELD, RELEASE, *range(UNKNOWNS)[CENTRE], *fitted]
+    u, fit = problem.minimise(u, free, iterations, min_gain=1e-3)
+    still, *during = problem.results(u, fit, free)
+    return SwingFit(still, during, sag(body, still.shape))
 
 
 def sag(body: RestingBody, shape: Sequence[float]) -> float:
-    """Drop of the free end before a release [m]: of the points of the surface that are farthest from the clamp."""
-    moved = body.positions(np.array(shape)) - body.undeformed
+    """Drop of the free end before a release against the undeformed body [m]."""
+    return float(_drop(body, body.positions(np.array(shape))))
+
+
+def vibration(swing: Swing, shape: Sequence[float]) -> Vibration:
+    """That of the free end after the release, with the damping of the simulation."""
+    ratio, share, _, retardation = shape
+    longer = replace(swing, duration=_VIBRATION * swing.duration, _paths={})
+    times = np.arange(0.0, longer.duration, FRAME)
+    return fit_vibration(times, _drop(swing.resting, longer.path(ratio, share, retardation)(times)))
+
+
+def _drop(body: RestingBody, x: Array) -> Array:
+    """Mean drop (...) [m] of the points of a surface (..., P, 3) that are farthest from the clamp."""
     low, high = np.array(body.clamps[0].lowest), np.array(body.clamps[0].highest)
     away = np.maximum(low - body.undeformed, body.undeformed - high).max(axis=1)
     end = away > away.max() - 1e-6
-    return float((moved[end] @ body.gravity).mean() / np.linalg.norm(body.gravity))
+    down = body.gravity / np.linalg.norm(body.gravity)
+    return ((x - body.undeformed)[..., end, :] @ down).mean(axis=-1)
 
 
 def swing_record(
@@ -240,7 +280,7 @@ def swing_record(
     cells: Sequence[float],
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Predict a swing from the hanging body under each clamp, and fit it, on each grid.
+    """Predict a swing from the hanging body under each clamp, and fit it without and with a viscosity, on each grid.
 
     Args:
         mesh: surface in the unit of the file.
@@ -251,31 +291,60 @@ def swing_record(
         cells: edges of a cell of the simulation [m].
 
     Returns:
-        Plain values: ``clamps``, name -> ``hang``, mu / rho, and ``grids``, a list of ``cell``, ``predicted`` and
-        ``fitted``, see `SwingFit.as_dict`, and ``silhouettes``, those of the prediction on the last grid [px].
+        Plain values: ``clamps``, name -> ``hang``, mu / rho, ``grids``, a list of ``cell`` and the results of `FITS`,
+        see `SwingFit.as_dict`, ``damped``, the result with a retardation time on the first grid, with its ``vibration``
+        and the same ``without_viscosity``, and ``silhouettes``, those of the prediction on the last grid [px].
+        ``ratio``, mu / rho of the elastic body, is extrapolated from the last two grids. Its ``log_std`` combines
+        ``noise_std`` and ``grid_std``, the step of the extrapolation, and over all clamps ``clamp_std``.
     """
-    clamps, done, total = {}, 0, 2 * len(ratios) * len(cells)
+    clamps, done, total = {}, 0, (len(FITS) * len(cells) + 1) * len(ratios)
     duration = max(frames) - min(0.0, *FIRST_RELEASES) + 0.02
-    prior = np.array(settings.placement), settings.placement_std
+    pictures = held, list(frames.values()), list(frames)
+    prior = poses, np.array(settings.placement), settings.placement_std
+
+    def fit(motion: Swing, ratio: float, fitted: Sequence[int], before: SwingFit | None) -> SwingFit:
+        nonlocal done
+        result = fit_swing(*pictures, motion, *prior, ratio, fitted, before)
+        done += 1
+        if progress:
+            progress(done, total)
+        return result
+
     for name, ratio in ratios.items():
-        body, grids = resting_body(mesh, settings, settings.clamps[name], size, swing.held), []
-        silhouettes: list[list] = []
-        for dx in cells:
-            motion = Swing(body, resting_law(settings.nu), dx, duration)
-            own: dict[str, Any] = {"cell": dx}
-            for key in ("predicted", "fitted"):
-                given = key == "predicted"
-                fit = fit_swing(
-                    held, list(frames.values()), list(frames), motion, poses, *prior, ratio, given
-                )
-                own[key] = fit.as_dict()
-                if given:
-                    silhouettes = [
-                        [line.round(1).tolist() for line in contours(frame.predicted)] for frame in fit.frames
-                    ]
-                done += 1
-                if progress:
-                    progress(done, total)
+        body = resting_body(mesh, settings, settings.clamps[name], size, swing.held)
+        motions = [Swing(body, resting_law(settings.nu), dx, duration) for dx in cells]
+        grids: list[dict[str, SwingFit]] = []
+        for motion in motions:
+            own: dict[str, SwingFit] = {}
+            for key, fitted in FITS.items():
+                before = grids[-1][key] if grids else own.get("predicted")
+                own[key] = fit(motion, ratio, fitted, before)
             grids.append(own)
-        clamps[name] = {"hang": ratio, "grids": grids, "silhouettes": silhouettes}
-    return {"times": list(frames), "clamps": clamps}
+        damped = fit(motions[0], ratio, (RATIO, RETARDATION), grids[0]["fitted"])
+        shape = damped.held.shape
+        vibrations = {"vibration": shape, "without_viscosity": (*shape[:3], 0.0)}
+        silhouettes = [contours(frame.predicted) for frame in grids[-1]["predicted"].frames]
+        results = [
+            {"cell": dx, **{key: each.as_dict() for key, each in own.items()}}
+            for dx, own in zip(cells, grids, strict=True)
+        ]
+        clamps[name] = {
+            "hang": ratio,
+            "grids": results,
+            "damped": damped.as_dict()
+            | {key: asdict(vibration(motions[0], own)) for key, own in vibrations.items()},
+            "silhouettes": [[line.round(1).tolist() for line in lines] for lines in silhouettes],
+            **over_grids(results),
+        }
+    return {"times": list(frames), "clamps": clamps, **over_clamps(clamps)}
+
+
+def over_grids(grids: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """mu / rho of the elastic body from the last two of ``grids``, see `swing_record`."""
+    log, noise = math.log(grids[-1]["fitted"]["ratio"]), grids[-1]["fitted"]["log_std"]
+    step = 0.0
+    if len(grids) > 1:
+        coarse = math.log(grids[-2]["fitted"]["ratio"])
+        step = extrapolated(coarse, log, grids[-2]["cell"] / grids[-1]["cell"]) - log
+    std = math.hypot(noise, step)
+    return {"ratio": math.exp(log + step), "noise_std": noise, "grid_std": abs(step), "log_std": std}

@@ -80,8 +80,6 @@ class Adaptor(nn.Module):
 class AdaptableConstitutive(Constitutive):
     """A network with frozen base weights and an optional adaptor."""
 
-    isotropic = False
-    """Whether the response is isotropic for any weights."""
     base: nn.ParameterList
     adaptor: Adaptor | None
 

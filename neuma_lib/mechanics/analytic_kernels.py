@@ -13,7 +13,7 @@ import warp as wp
 from torch import Tensor
 
 from neuma_lib.device import native_source, start_warp
-from neuma_lib.mechanics.fused_launch import launch_blocks
+from neuma_lib.mechanics.fused_launch import addressed, launch_blocks
 from neuma_lib.mechanics.singular_values_kernels import (
     END,
     FUSE,
@@ -62,6 +62,7 @@ CPU_WIDTH = {torch.float32: 32, torch.float64: 16}
 """Rows in a pack on a CPU: 1024 bits, so that two or more registers hide the latency of roots and quotients."""
 THREADS = 64
 """Threads per block on a GPU."""
+_own = addressed(copies=int, n=int)
 
 
 def row(law: str, coefficients: tuple[Tensor | float, ...]) -> Tensor:
@@ -99,15 +100,11 @@ def source(kind: Kind | Literal["flow"], backward: bool, dtype: torch.dtype) -> 
 def evaluate_kernel(kind: Kind, dtype: torch.dtype):
     """Kernel (F (copies n, 3, 3), rows, copies, n, cache, out), launched by `launch_blocks`."""
 
-    @wp.func_native(source(kind, False, dtype))
-    def evaluate_rows(
-        F: wp.uint64, rows: wp.uint64, copies: int, n: int, cache: wp.uint64, out: wp.uint64
-    ): ...
+    @_own.func_native(source(kind, False, dtype))
+    def evaluate_rows(F, rows, copies, n, cache, out): ...
 
-    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
-    def analytic_evaluate(
-        F: wp.uint64, rows: wp.uint64, copies: int, n: int, cache: wp.uint64, out: wp.uint64
-    ):
+    @_own.kernel("unique", grid_stride=False)
+    def analytic_evaluate(F, rows, copies, n, cache, out):
         evaluate_rows(F, rows, copies, n, cache, out)
 
     return analytic_evaluate
@@ -120,17 +117,11 @@ def vjp_kernel(kind: Kind, dtype: torch.dtype):
     It writes sums of the gradients of the coefficients over packs to partials (packs, COEFFICIENTS) if these are given.
     """
 
-    @wp.func_native(source(kind, True, dtype))
-    def vjp_rows(
-        F: wp.uint64, rows: wp.uint64, copies: int, n: int, cache: wp.uint64, grad_out: wp.uint64, grad_F: wp.uint64,
-        partials: wp.uint64,
-    ): ...  # fmt: skip
+    @_own.func_native(source(kind, True, dtype))
+    def vjp_rows(F, rows, copies, n, cache, grad_out, grad_F, partials): ...
 
-    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
-    def analytic_vjp(
-        F: wp.uint64, rows: wp.uint64, copies: int, n: int, cache: wp.uint64, grad_out: wp.uint64, grad_F: wp.uint64,
-        partials: wp.uint64,
-    ):  # fmt: skip
+    @_own.kernel("unique", grid_stride=False)
+    def analytic_vjp(F, rows, copies, n, cache, grad_out, grad_F, partials):
         vjp_rows(F, rows, copies, n, cache, grad_out, grad_F, partials)
 
     return analytic_vjp
@@ -140,17 +131,11 @@ def vjp_kernel(kind: Kind, dtype: torch.dtype):
 def flow_kernel(dtype: torch.dtype):
     """Kernel (F_trial, rows, elastic_rows, copies, n, cache, F, tau) of a return map and the stress after it."""
 
-    @wp.func_native(source("flow", False, dtype))
-    def evaluate_flow(
-        F: wp.uint64, rows: wp.uint64, elastic_rows: wp.uint64, copies: int, n: int, cache: wp.uint64, out: wp.uint64,
-        stress_out: wp.uint64,
-    ): ...  # fmt: skip
+    @_own.func_native(source("flow", False, dtype))
+    def evaluate_flow(F, rows, elastic_rows, copies, n, cache, out, stress_out): ...
 
-    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
-    def analytic_flow(
-        F: wp.uint64, rows: wp.uint64, elastic_rows: wp.uint64, copies: int, n: int, cache: wp.uint64, out: wp.uint64,
-        stress_out: wp.uint64,
-    ):  # fmt: skip
+    @_own.kernel("unique", grid_stride=False)
+    def analytic_flow(F, rows, elastic_rows, copies, n, cache, out, stress_out):
         evaluate_flow(F, rows, elastic_rows, copies, n, cache, out, stress_out)
 
     return analytic_flow
@@ -163,18 +148,16 @@ def flow_vjp_kernel(dtype: torch.dtype):
     The partials of both laws are as those of `vjp_kernel`.
     """
 
-    @wp.func_native(source("flow", True, dtype))
+    @_own.func_native(source("flow", True, dtype))
     def vjp_flow(
-        F: wp.uint64, rows: wp.uint64, elastic_rows: wp.uint64, copies: int, n: int, cache: wp.uint64,
-        returned_F: wp.uint64, grad_out: wp.uint64, grad_stress: wp.uint64, grad_F: wp.uint64,
-        partials: wp.uint64, elastic_partials: wp.uint64,
+        F, rows, elastic_rows, copies, n, cache, returned_F, grad_out, grad_stress, grad_F, partials,
+        elastic_partials,
     ): ...  # fmt: skip
 
-    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
+    @_own.kernel("unique", grid_stride=False)
     def analytic_flow_vjp(
-        F: wp.uint64, rows: wp.uint64, elastic_rows: wp.uint64, copies: int, n: int, cache: wp.uint64,
-        returned_F: wp.uint64, grad_out: wp.uint64, grad_stress: wp.uint64, grad_F: wp.uint64,
-        partials: wp.uint64, elastic_partials: wp.uint64,
+        F, rows, elastic_rows, copies, n, cache, returned_F, grad_out, grad_stress, grad_F, partials,
+        elastic_partials,
     ):  # fmt: skip
         vjp_flow(
             F, rows, elastic_rows, copies, n, cache, returned_F, grad_out, grad_stress, grad_F, partials,

@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import threading
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
+from types import SimpleNamespace
 
 import torch
 import warp as wp
 from torch import Tensor
 
-from neuma_lib.device import warp_stream
+from neuma_lib.device import typed, warp_stream
 
 BLOCKS_PER_PROCESSOR = 2
+
+
+def addressed(**types: type) -> SimpleNamespace:
+    """`neuma_lib.device.typed` for arguments of these types, and arrays as addresses for all others."""
+    return typed(defaultdict(lambda: wp.uint64, types))
 
 
 @cache

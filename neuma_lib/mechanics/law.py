@@ -47,6 +47,8 @@ class Constitutive(nn.Module):
     """Whether the law is one of `analytic_kernels`, which `kernel_rows` describes."""
     keeps_singular_values = False
     """Whether these kernels can keep singular values for the adjoint (`analytic_kernels.new_cache`)."""
+    shares_singular_values = False
+    """Whether the kernel of a stress can read those that the kernel of the return map before it has kept."""
     identity = False
     """Whether the result is always F."""
     adjoint_precision: AdjointPrecision = "single"

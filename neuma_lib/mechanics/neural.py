@@ -8,35 +8,29 @@ A network of three layers without bias, 13 -> 64 -> 64 -> 9 with GELU activation
 
 Zero features give zero output because there is no bias, so rotations are stress-free. R makes both maps objective.
 
-:mod:`neural_vector` has faster kernels for a CPU and :mod:`neural_fused` for float32 on recent GPUs. This module covers
-all other cases and is the reference implementation of those kernels.
+:mod:`neural_vector` has kernels for a CPU and :mod:`neural_fused` for float32 on GPUs with float16 tensor cores. On
+other GPUs, and in float64 on any, autograd differentiates `NeuralConstitutive.response`, the reference of the kernels.
 """
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Hashable
+from types import ModuleType
 
 import torch
 from torch import Tensor
-from torch.nn.functional import gelu, pad
+from torch.nn.functional import gelu
 
-from neuma_lib.device import launch
 from neuma_lib.errors import InputError
 from neuma_lib.mechanics import neural_fused, neural_vector
 from neuma_lib.mechanics.adaptor import AdaptableConstitutive, AdaptableLaw, layers_of
 from neuma_lib.mechanics.law import Elasticity, Plasticity, Weights
-from neuma_lib.mechanics.neural_kernels import FEATURES, feature_kernel, output_kernels
+from neuma_lib.mechanics.neural_vector import FEATURES
 from neuma_lib.mechanics.singular_values import rotation_and_singular_values
-from neuma_lib.mechanics.singular_values_kernels import CPU_WIDTH, pack_count
 
 WIDTH = 64
 SHAPES = ((WIDTH, FEATURES), (WIDTH, WIDTH), (9, WIDTH))
 PLASTIC_SCALE = 1e-3
-PADDED = 16
-"""Columns of the gradient of the features. BLAS is four times faster with 16 than with 13."""
-
-aten = torch.ops.aten
 
 
 def features(F: Tensor, sigma: Tensor) -> Tensor:
@@ -46,57 +40,21 @@ def features(F: Tensor, sigma: Tensor) -> Tensor:
     return torch.cat([sigma - 1, gram, torch.linalg.det(F)[:, None] - 1], dim=1)
 
 
-class _Forward:
-    """Intermediate values of a forward pass over the rows F (n, 3, 3), for the adjoint."""
-
-    def __init__(self, F: Tensor):
-        n = len(F)
-        self.z = F.new_empty(n, FEATURES)
-        self.R, self.Vh, self.Y = (torch.empty_like(F) for _ in range(3))
-        self.a0, self.h0, self.a1, self.h1 = (F.new_empty(n, WIDTH) for _ in range(4))
-
-
-class _Backward:
-    """Scratch memory of the adjoint over the rows F. grad_z has padding columns."""
-
-    def __init__(self, F: Tensor):
-        n = len(F)
-        self.grad_Y = torch.empty_like(F)
-        self.grad_h, self.grad_a = F.new_empty(n, WIDTH), F.new_empty(n, WIDTH)
-        self.grad_z = F.new_empty(n, PADDED)
-
-
-class _Scratch(threading.local):
-    """Reused buffers by (kind, rows, dtype, device), one set per thread."""
-
-    def __init__(self):
-        self.buffers: dict[tuple, _Forward | _Backward] = {}
-
-    def get(self, kind: type, F: Tensor):
-        key = (kind, len(F), F.dtype, F.device)
-        if key not in self.buffers:
-            if len(self.buffers) > 32:  # recorded graphs hold the addresses of buffers on a GPU
-                self.buffers = {k: buffer for k, buffer in self.buffers.items() if k[-1].type != "cpu"}
-            self.buffers[key] = kind(F)
-        return self.buffers[key]
-
-
-_scratch = _Scratch()
-
-
 class NeuralConstitutive(AdaptableConstitutive):
     """A network with frozen base weights and an optional adaptor: M = M_0 + Delta M (paper Eq. 3)."""
 
     kind: str
     scale: float
-    capturable = True
     native = True
-    fused: bool | None = None
-    """Whether evaluate and vjp use :mod:`neural_fused` or :mod:`neural_vector`: False never, True always, None where
-    these are supported."""
+    keeps_singular_values = True
+    loops = True
+
+    @property
+    def capturable(self) -> bool:
+        return neural_fused.supported(self.base[0].device, self.base[0].dtype)
 
     def graph_key(self) -> Hashable:
-        return type(self), self.fused, self.adjoint_precision
+        return type(self), self.adjoint_precision
 
     def __init__(self, weights: Weights | None = None, seed: int = 0):
         """Args: weights: three matrices of :data:`SHAPES`, by default Xavier-uniform from ``seed``."""
@@ -119,93 +77,48 @@ class NeuralConstitutive(AdaptableConstitutive):
         X = 0.5 * (Y + Y.mT)
         return R @ X @ F.mT if self.kind == "elasticity" else F + self.scale * (R @ X)
 
-    def uses_fused(self, F: Tensor) -> bool:
-        """Whether fused kernels evaluate F, depending on its device, its dtype and :attr:`fused`."""
-        kernels = neural_vector if F.device.type == "cpu" else neural_fused
-        return kernels.supported(F.device, F.dtype) if self.fused is None else self.fused
-
     def evaluate(self, F: Tensor, weights: Weights, out: Tensor | None = None) -> Tensor:
-        if not self.uses_fused(F):
-            return self._evaluate(F, weights, out)
-        kernels = neural_vector if F.device.type == "cpu" else neural_fused
+        kernels = _kernels(F)
+        if kernels is None:
+            return super().evaluate(F, weights, out)
         return kernels.evaluate(F, weights, self.kind, self.scale, out)
 
     def evaluate_with_cache(self, F, weights, out=None, cache=None):
-        if not self.uses_fused(F):
-            cache = cache or _Forward(F)
-            return self._evaluate(F, weights, out, cache), cache
         if F.device.type != "cpu":
             return self.evaluate(F, weights, out), None
-        cache = neural_vector.new_cache(F) if cache is None else cache
+        cache = F.new_empty(self.cache_shape(F, weights)) if cache is None else cache
         return neural_vector.evaluate(F, weights, self.kind, self.scale, out, cache), cache
 
-    @torch.no_grad()
-    def _evaluate(self, F, weights, out, state=None):
-        F = F.detach().contiguous()
-        out = torch.empty_like(F) if out is None else out
-        result, _, _ = output_kernels(F.dtype, self.kind)
-        if len(F):
-            state = state or _scratch.get(_Forward, F)
-            self._network(F, weights, state)
-            launch(result, len(F), F, state.R, state.Y, self.scale, out)
-        return out
+    def kernel(self, F, weights, backward):
+        return neural_vector.kernel_of(self.kind, self.scale, F, weights, backward)
 
-    def _network(self, F: Tensor, weights: Weights, state: _Forward) -> None:
-        """Fill ``state`` from the rows F."""
-        packs = pack_count(len(F), F.device, CPU_WIDTH[F.dtype])
-        launch(feature_kernel(F.dtype), packs, F, state.z, state.R, state.Vh, len(F))
-        W0, W1, W2 = weights
-        torch.mm(state.z, W0.mT, out=state.a0)
-        aten.gelu.out(state.a0, out=state.h0)
-        torch.mm(state.h0, W1.mT, out=state.a1)
-        aten.gelu.out(state.a1, out=state.h1)
-        torch.mm(state.h1, W2.mT, out=state.Y.view(-1, 9))
+    def cache_shape(self, F, weights):
+        return neural_vector.cache_shape(F)
 
     def accumulators(self, F, grad_weights):
-        sums_blocks = F.device.type != "cpu" and self.uses_fused(F)
-        return (neural_fused.partial_sums(F),) if sums_blocks else grad_weights
+        return (neural_fused.partial_sums(F),) if _kernels(F) is neural_fused else grad_weights
 
     @torch.no_grad()
     def add_up(self, accumulators, weights, grad_weights):
         if len(accumulators) != len(grad_weights):
             neural_fused.add_up(*accumulators, grad_weights)
 
-    @torch.no_grad()
     def vjp(self, F, weights, grad_out, cache=None, grad_F=None, grad_weights=None):
-        if self.uses_fused(F):
-            if F.device.type == "cpu":
-                grads = (cache, grad_F, grad_weights)
-                return neural_vector.vjp(F, weights, grad_out, self.kind, self.scale, *grads)
+        kernels = _kernels(F)
+        if kernels is None:
+            return super().vjp(F, weights, grad_out, cache, grad_F, grad_weights)
+        if kernels is neural_vector:
+            grads = (cache, grad_F, grad_weights)
+        else:
             grads = (grad_F, grad_weights, self.adjoint_precision)
-            return neural_fused.vjp(F, weights, grad_out, self.kind, self.scale, *grads)
-        F, g = F.detach().contiguous(), grad_out.contiguous()
-        weights = tuple(w.detach() for w in weights)
-        grad_F = torch.empty_like(F) if grad_F is None else grad_F
-        if grad_weights is None:
-            grad_weights = tuple(torch.zeros_like(w) for w in weights)
-        if not len(F):
-            return grad_F, grad_weights
-        _, output_adjoint, input_adjoint = output_kernels(F.dtype, self.kind)
-        W0, W1, W2 = weights
-        state = _scratch.get(_Forward, F) if cache is None else cache
-        if cache is None:
-            self._network(F, weights, state)
-        back = _scratch.get(_Backward, F)
-        launch(output_adjoint, len(F), F, state.R, g, self.scale, back.grad_Y)
-        grad_Y = back.grad_Y.view(-1, 9)
-        grad_weights[2].addmm_(grad_Y.mT, state.h1)
-        torch.mm(grad_Y, W2, out=back.grad_h)
-        aten.gelu_backward.grad_input(back.grad_h, state.a1, grad_input=back.grad_a)
-        grad_weights[1].addmm_(back.grad_a.mT, state.h0)
-        torch.mm(back.grad_a, W1, out=back.grad_h)
-        aten.gelu_backward.grad_input(back.grad_h, state.a0, grad_input=back.grad_a)
-        grad_weights[0].add_((state.z.mT @ back.grad_a).mT)  # faster than the other order of factors
-        torch.mm(back.grad_a, pad(W0, (0, PADDED - FEATURES)), out=back.grad_z)
-        launch(
-            input_adjoint, len(F), F, state.R, state.Vh, state.z, state.Y, g, back.grad_z[:, :FEATURES], self.scale,
-            grad_F,
-        )  # fmt: skip
-        return grad_F, grad_weights
+        return kernels.vjp(F, weights, grad_out, self.kind, self.scale, *grads)
+
+
+def _kernels(F: Tensor) -> ModuleType | None:
+    """The module with kernels for the device and dtype of F, if there is one."""
+    if F.device.type == "cpu":
+        return neural_vector
+    return neural_fused if neural_fused.supported(F.device, F.dtype) else None
 
 
 class NeuralElasticity(NeuralConstitutive, Elasticity):

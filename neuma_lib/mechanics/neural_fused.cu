@@ -429,8 +429,7 @@
         publish(OF_Z, down_z);
 
 // With g the gradient of the result, B = R^T grad_P and grad_Y = sym(B). The rotation contributes R skew(V kappa) to
-// grad_F, kappa_i = m_i / (sigma_j + sigma_k), m = Vh axial(B X). In `input_adjoint` of neural_kernels.py, M - M^T is
-// skew(m).
+// grad_F, kappa_i = m_i / (sigma_j + sigma_k), m = Vh axial(B X). M - M^T is skew(m) for M = Vh (B X) V.
 //// vjp
         publish(OF_H0, down_h0);
         // y becomes gelu' of the second layer, x becomes h1

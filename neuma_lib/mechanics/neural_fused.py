@@ -1,6 +1,6 @@
 """Neural constitutive law as one CUDA kernel forward and one backward: features, network, stress.
 
-The reference in :mod:`neuma_lib.mechanics.neural` writes every activation to memory and launches a dozen kernels.
+The reference in :mod:`neuma_lib.mechanics.neural` writes every activation to memory and launches dozens of kernels.
 These kernels (``neural_fused.cu``) read only F, write only the result, and recompute activations in the backward pass.
 
 A warp owns one or two tiles of 16 rows. Each lane computes the features and the final output of one row, and the tensor
@@ -30,13 +30,14 @@ from torch import Tensor
 from neuma_lib.device import native_source
 from neuma_lib.mechanics.fused_launch import (
     BLOCKS_PER_PROCESSOR,
+    addressed,
     block_count,
     contiguous,
     launch_blocks,
     warp_device,
 )
 from neuma_lib.mechanics.law import Weights
-from neuma_lib.mechanics.neural_kernels import FEATURES, GRAM
+from neuma_lib.mechanics.neural_vector import FEATURES, GRAM
 from neuma_lib.mechanics.singular_values_kernels import SVD, SWEEPS
 
 ROWS = 128
@@ -137,21 +138,13 @@ def source(kind: str, backward: bool, machine: str | None = None, precision: str
 def evaluate_kernel(kind: str):
     """Kernel (F, W0, W1, W2, factor, n, out) over blocks of :data:`ROWS` rows."""
 
-    @wp.func_native(source(kind, backward=False))
-    def evaluate_rows(
-        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, factor: float, n: int, out: wp.uint64,
-        shared: wp.tile(dtype=wp.uint8, shape=(EVALUATE_BYTES,)),
-    ): ...  # fmt: skip
+    own = addressed(factor=float, n=int, shared=wp.tile(dtype=wp.uint8, shape=(EVALUATE_BYTES,)))
 
-    @wp.kernel(
-        enable_backward=False,
-        module="unique",
-        launch_bounds=(threads(EVALUATE_TILES), BLOCKS_PER_PROCESSOR),
-        grid_stride=False,
-    )
-    def neural_evaluate(
-        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, factor: float, n: int, out: wp.uint64
-    ):
+    @own.func_native(source(kind, backward=False))
+    def evaluate_rows(F, W0, W1, W2, factor, n, out, shared): ...
+
+    @own.kernel("unique", launch_bounds=(threads(EVALUATE_TILES), BLOCKS_PER_PROCESSOR), grid_stride=False)
+    def neural_evaluate(F, W0, W1, W2, factor, n, out):
         shared = wp.tile_empty(shape=(EVALUATE_BYTES,), dtype=wp.uint8, storage="shared")
         evaluate_rows(F, W0, W1, W2, factor, n, out, shared)
 
@@ -165,22 +158,13 @@ def vjp_kernel(kind: str, precision: str = "single"):
     It overwrites ``partials`` if ``fresh``, and adds to them otherwise.
     """
 
-    @wp.func_native(source(kind, backward=True, precision=precision))
-    def vjp_rows(
-        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, grad_out: wp.uint64, factor: float, n: int,
-        grad_F: wp.uint64, fresh: int, partials: wp.uint64, shared: wp.tile(dtype=wp.uint8, shape=(VJP_BYTES,)),
-    ): ...  # fmt: skip
+    own = addressed(factor=float, n=int, fresh=int, shared=wp.tile(dtype=wp.uint8, shape=(VJP_BYTES,)))
 
-    @wp.kernel(
-        enable_backward=False,
-        module="unique",
-        launch_bounds=(threads(VJP_TILES), BLOCKS_PER_PROCESSOR),
-        grid_stride=False,
-    )
-    def neural_vjp(
-        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, grad_out: wp.uint64, factor: float, n: int,
-        grad_F: wp.uint64, fresh: int, partials: wp.uint64,
-    ):  # fmt: skip
+    @own.func_native(source(kind, backward=True, precision=precision))
+    def vjp_rows(F, W0, W1, W2, grad_out, factor, n, grad_F, fresh, partials, shared): ...
+
+    @own.kernel("unique", launch_bounds=(threads(VJP_TILES), BLOCKS_PER_PROCESSOR), grid_stride=False)
+    def neural_vjp(F, W0, W1, W2, grad_out, factor, n, grad_F, fresh, partials):
         shared = wp.tile_empty(shape=(VJP_BYTES,), dtype=wp.uint8, storage="shared")
         vjp_rows(F, W0, W1, W2, grad_out, factor, n, grad_F, fresh, partials, shared)
 
@@ -191,13 +175,13 @@ def vjp_kernel(kind: str, precision: str = "single"):
 def add_kernel():
     """Kernel (partials (blocks, WEIGHTS), blocks, three accumulators) that adds the sums over blocks."""
 
-    @wp.func_native(_constants(CONSTANTS) + native_source(__file__)["add"])
-    def add_columns(
-        partials: wp.uint64, blocks: int, total0: wp.uint64, total1: wp.uint64, total2: wp.uint64
-    ): ...
+    own = addressed(blocks=int)
 
-    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
-    def neural_add(partials: wp.uint64, blocks: int, total0: wp.uint64, total1: wp.uint64, total2: wp.uint64):
+    @own.func_native(_constants(CONSTANTS) + native_source(__file__)["add"])
+    def add_columns(partials, blocks, total0, total1, total2): ...
+
+    @own.kernel("unique", grid_stride=False)
+    def neural_add(partials, blocks, total0, total1, total2):
         add_columns(partials, blocks, total0, total1, total2)
 
     return neural_add

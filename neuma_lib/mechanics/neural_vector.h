@@ -1,6 +1,14 @@
 // Kernels of neural_vector.py: both directions of a network over blocks of BLOCK rows on a CPU. SVD, features and
 // stress hold a row per SIMD lane, the layers an output per lane. The module defines constants and polynomials.
 
+// Features are sigma - 1 (3), F^T F - I (9, row-major) and det F - 1 (1). The SVD scales a[], so this part precedes it.
+//// gram
+    Pack gram[9], det;
+    for (int i = 0; i < 3; ++i)
+        for (int j = 0; j < 3; ++j) gram[3 * i + j] = a[i] * a[j] + a[3 + i] * a[3 + j] + a[6 + i] * a[6 + j];
+    det = a[0] * (a[4] * a[8] - a[5] * a[7]) - a[1] * (a[3] * a[8] - a[5] * a[6])
+        + a[2] * (a[3] * a[7] - a[4] * a[6]);
+
 // Tiles of matrix products, in registers: ROWS rows times COLUMNS packs.
 //// tools
     // 512 bits of consecutive numbers of a row
@@ -98,20 +106,16 @@
     #define NN 3, 1, 3, 1
     #define NT 3, 1, 1, 3
     #define TN 1, 3, 3, 1
-    // Scratch memory. Weights with merged rows or columns of symmetric pairs, each as left and as right factor.
-    Real* free_memory = (Real*)((work + 127) & ~(uint64_t)127);
-    auto take = [&](int count) {
-        Real* const here = free_memory;
-        free_memory += count;
-        return here;
-    };
-    Real* const w0_T = take(INPUTS * HIDDEN);  // (10, 64)
-    Real* const w1_T = take(HIDDEN * HIDDEN);  // (64, 64)
-    Real* const w2_T = take(HIDDEN * NARROW);  // (64, 16)
-    Real* const z = take(BLOCK * NARROW);      // features, then their gradient
-    Real* const y = take(BLOCK * NARROW);      // X, then its gradient
-    Real* const h0 = take(BLOCK * HIDDEN);
-    Real* const h1 = take(BLOCK * HIDDEN);
+    // Weights with merged rows or columns of symmetric pairs, each as left and as right factor.
+    #define ALIGNED __attribute__((aligned(128)))
+    Real w0_T[INPUTS * HIDDEN] ALIGNED;  // (10, 64)
+    Real w1_T[HIDDEN * HIDDEN] ALIGNED;  // (64, 64)
+    Real w2_T[HIDDEN * NARROW] ALIGNED;  // (64, 16)
+    Real z[BLOCK * NARROW] ALIGNED;      // features, then their gradient
+    Real y[BLOCK * NARROW] ALIGNED;      // X, then its gradient
+    Real h0[BLOCK * HIDDEN] ALIGNED, h1[BLOCK * HIDDEN] ALIGNED;
+    Real scratch[KEPT * BLOCK] ALIGNED;
+    auto kept_of = [&](size_t begin) { return (Pack*)(cached ? (Real*)cache + begin * KEPT : scratch); };
     const Real* const W0_ = (const Real*)W0;
     const Real* const W1_ = (const Real*)W1;
     const Real* const W2_ = (const Real*)W2;
@@ -167,9 +171,8 @@
     };
 
 //// evaluate
-    Pack* const scratch = (Pack*)take(KEPT * BLOCK);
     for (size_t begin = 0; begin < (size_t)n; begin += BLOCK) {
-        Pack* const kept = cache ? (Pack*)((Real*)cache + begin * KEPT) : scratch;
+        Pack* const kept = kept_of(begin);
         features(begin, kept, false);
         product(Square(), BLOCK, HIDDEN, INPUTS, z, NARROW, 1, w0_T, h0, false);
         gelu(false, h0, nullptr);
@@ -190,31 +193,26 @@
     }
 
 //// vjp
-    Real* const w0 = take(HIDDEN * NARROW);  // (64, 16)
-    Real* const w1 = take(HIDDEN * HIDDEN);  // (64, 64)
-    Real* const w2 = take(OUTPUTS * HIDDEN);  // (6, 64)
-    Real* const slope0 = take(BLOCK * HIDDEN);
-    Real* const slope1 = take(BLOCK * HIDDEN);
-    Real* const g0 = take(BLOCK * HIDDEN);
-    Real* const g1 = take(BLOCK * HIDDEN);
-    Real* const sum0 = take(INPUTS * HIDDEN);  // gradients of w0_T, w1 and w2
-    Real* const sum1 = take(HIDDEN * HIDDEN);
-    Real* const sum2 = take(OUTPUTS * HIDDEN);
-    Pack* const scratch = (Pack*)take(KEPT * BLOCK);
+    Real w0[HIDDEN * NARROW] ALIGNED;   // (64, 16)
+    Real w1[HIDDEN * HIDDEN] ALIGNED;   // (64, 64)
+    Real w2[OUTPUTS * HIDDEN] ALIGNED;  // (6, 64)
+    Real slope0[BLOCK * HIDDEN] ALIGNED, slope1[BLOCK * HIDDEN] ALIGNED;
+    Real g0[BLOCK * HIDDEN] ALIGNED, g1[BLOCK * HIDDEN] ALIGNED;
+    // gradients of w0_T, w1 and w2
+    Real sum0[INPUTS * HIDDEN] ALIGNED = {}, sum1[HIDDEN * HIDDEN] ALIGNED = {}, sum2[OUTPUTS * HIDDEN] ALIGNED = {};
     for (int o = 0; o < HIDDEN; ++o) {
         for (int k = 0; k < NARROW; ++k) w0[NARROW * o + k] = k < INPUTS ? w0_T[HIDDEN * k + o] : Real(0);
         for (int k = 0; k < OUTPUTS; ++k) w2[HIDDEN * k + o] = w2_T[NARROW * o + k];
         for (int i = 0; i < HIDDEN; ++i) w1[HIDDEN * o + i] = W1_[HIDDEN * o + i];
     }
-    for (int i = 0; i < HIDDEN * (INPUTS + HIDDEN + OUTPUTS); ++i) sum0[i] = Real(0);
     for (size_t begin = 0; begin < (size_t)n; begin += BLOCK) {
-        Pack* const kept = cache ? (Pack*)((Real*)cache + begin * KEPT) : scratch;
-        features(begin, kept, cache != 0);
+        Pack* const kept = kept_of(begin);
+        features(begin, kept, cached);
         product(Square(), BLOCK, HIDDEN, INPUTS, z, NARROW, 1, w0_T, h0, false);
         gelu(true, h0, slope0);
         product(Square(), BLOCK, HIDDEN, HIDDEN, h0, HIDDEN, 1, w1_T, h1, false);
         gelu(true, h1, slope1);
-        if (!cache) product(Narrow(), BLOCK, NARROW, HIDDEN, h1, HIDDEN, 1, w2_T, y, false);
+        if (!cached) product(Narrow(), BLOCK, NARROW, HIDDEN, h1, HIDDEN, 1, w2_T, y, false);
         Pack direct[BLOCK / WIDTH][9], grad_R[BLOCK / WIDTH][9];
         for (int pack = 0; pack < BLOCK / WIDTH; ++pack) {
             const size_t first = begin + pack * WIDTH;
@@ -225,7 +223,7 @@
                 for (int l = used; l < WIDTH; ++l)
                     for (int k = 0; k < 9; ++k) LANE(g[k], l) = Real(0);
             } else for (int k = 0; k < 9; ++k) g[k] = Pack{};
-            rotation_and_output(pack, kept + KEPT * pack, cache != 0, R, X);
+            rotation_and_output(pack, kept + KEPT * pack, cached, R, X);
             if (elastic) {
                 Pack f[9];
                 const size_t start = first < (size_t)n ? first : n - 1;
@@ -287,6 +285,11 @@
                     const Pack cofactor = f[3 * i1 + j1] * f[3 * i2 + j2] - f[3 * i1 + j2] * f[3 * i2 + j1];
                     M[3 * i + j] += T[3 * i + j] + gz[9] * cofactor + direct[pack][3 * i + j];
                 }
+            if (adds) {
+                Pack before[9];
+                load(grad_F, first, used, before);
+                for (int k = 0; k < 9; ++k) M[k] += before[k];
+            }
             store(grad_F, first, used, M);
         }
     }
@@ -313,3 +316,4 @@
     #undef NN
     #undef NT
     #undef TN
+    #undef ALIGNED

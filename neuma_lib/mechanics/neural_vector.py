@@ -6,7 +6,6 @@ polynomials for the standard normal distribution and its density. The backward k
 """
 
 import math
-import threading
 from collections.abc import Callable
 from fractions import Fraction
 from functools import cache
@@ -17,11 +16,13 @@ from torch import Tensor
 
 from neuma_lib.device import native_source
 from neuma_lib.mechanics.analytic_kernels import CPU_WIDTH
-from neuma_lib.mechanics.fused_launch import contiguous, launch_blocks
+from neuma_lib.mechanics.fused_launch import addressed, contiguous, launch_blocks
 from neuma_lib.mechanics.law import Weights
-from neuma_lib.mechanics.neural_kernels import FEATURES, GRAM
 from neuma_lib.mechanics.singular_values_kernels import END, FUSE, SVD, TYPES, filled, warp_types
 
+FEATURES = 13
+GRAM = native_source(__file__, ".h")["gram"]
+"""C++ source of F^T F and det F."""
 BLOCK = 64
 """Rows per block."""
 HIDDEN = 64
@@ -35,13 +36,6 @@ RANGE = {torch.float32: 5.75, torch.float64: 8.3}
 """|x| from which the standard normal distribution is constant to round-off."""
 TERMS = {torch.float32: (16, 6), torch.float64: (36, 12)}
 """Coefficients of the polynomials for the distribution and the density, for an error of round-off."""
-SCRATCH = (
-    HIDDEN * (2 * (INPUTS + HIDDEN) + NARROW)  # factors of the forward pass, and of the sums of gradients
-    + HIDDEN * (NARROW + HIDDEN + 2 * OUTPUTS)  # factors of the backward pass
-    + BLOCK * (2 * NARROW + 6 * HIDDEN + KEPT)
-    + 32  # alignment
-)
-"""Numbers that a kernel uses for intermediate values."""
 
 
 def chebyshev(function: Callable[[float], float], low: float, high: float, terms: int) -> list[float]:
@@ -94,68 +88,59 @@ def source(backward: bool, dtype: torch.dtype) -> str:
 
 @cache
 def evaluate_kernel(dtype: torch.dtype):
-    """Kernel (F, W0, W1, W2, elastic, scale, n, cache, out, work), launched by `launch_blocks`."""
-    real, _, _ = warp_types(dtype)
+    """Kernel (F, W0, W1, W2, elastic, scale, n, cached, cache, out), launched by `launch_blocks`.
 
-    @wp.func_native(source(False, dtype))
-    def evaluate_rows(
-        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, elastic: int, scale: real, n: int, cache: wp.uint64,
-        out: wp.uint64, work: wp.uint64,
-    ): ...  # fmt: skip
+    If ``cached`` is 1, it fills the cache.
+    """
+    own = addressed(elastic=int, scale=warp_types(dtype)[0], n=int, cached=int)
 
-    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
-    def neural_vector_evaluate(
-        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, elastic: int, scale: real, n: int, cache: wp.uint64,
-        out: wp.uint64, work: wp.uint64,
-    ):  # fmt: skip
-        evaluate_rows(F, W0, W1, W2, elastic, scale, n, cache, out, work)
+    @own.func_native(source(False, dtype))
+    def evaluate_rows(F, W0, W1, W2, elastic, scale, n, cached, cache, out): ...
+
+    @own.kernel("unique", grid_stride=False)
+    def neural_vector_evaluate(F, W0, W1, W2, elastic, scale, n, cached, cache, out):
+        evaluate_rows(F, W0, W1, W2, elastic, scale, n, cached, cache, out)
 
     return neural_vector_evaluate
 
 
 @cache
 def vjp_kernel(dtype: torch.dtype):
-    """Kernel (F, W0, W1, W2, elastic, scale, n, cache, grad_out, grad_F, total0, total1, total2, work), launched by
-    `launch_blocks`. It adds the gradients of the weights to the totals."""
-    real, _, _ = warp_types(dtype)
+    """Kernel (F, W0, W1, W2, elastic, scale, n, cached, cache, adds, grad_out, grad_F, total0, total1, total2).
 
-    @wp.func_native(source(True, dtype))
+    If ``cached`` is 2, it reads the cache. If ``adds`` is 1, it adds to grad_F. It adds the gradients of the weights to
+    the totals.
+    """
+    own = addressed(elastic=int, scale=warp_types(dtype)[0], n=int, cached=int, adds=int)
+
+    @own.func_native(source(True, dtype))
     def vjp_rows(
-        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, elastic: int, scale: real, n: int, cache: wp.uint64,
-        grad_out: wp.uint64, grad_F: wp.uint64, total0: wp.uint64, total1: wp.uint64, total2: wp.uint64,
-        work: wp.uint64,
-    ): ...  # fmt: skip
+        F, W0, W1, W2, elastic, scale, n, cached, cache, adds, grad_out, grad_F, total0, total1, total2
+    ): ...
 
-    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
+    @own.kernel("unique", grid_stride=False)
     def neural_vector_vjp(
-        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, elastic: int, scale: real, n: int, cache: wp.uint64,
-        grad_out: wp.uint64, grad_F: wp.uint64, total0: wp.uint64, total1: wp.uint64, total2: wp.uint64,
-        work: wp.uint64,
-    ):  # fmt: skip
-        vjp_rows(F, W0, W1, W2, elastic, scale, n, cache, grad_out, grad_F, total0, total1, total2, work)
+        F, W0, W1, W2, elastic, scale, n, cached, cache, adds, grad_out, grad_F, total0, total1, total2
+    ):
+        vjp_rows(
+            F, W0, W1, W2, elastic, scale, n, cached, cache, adds, grad_out, grad_F, total0, total1, total2
+        )  # fmt: skip
 
     return neural_vector_vjp
 
 
-_memory = threading.local()
+def kernel_of(
+    kind: str, scale: float, F: Tensor, weights: Weights, backward: bool
+) -> tuple[wp.Kernel, dict[str, Tensor | float]]:
+    """Kernel and arguments of `Constitutive.kernel`."""
+    values = {f"W{i}": w.detach().contiguous() for i, w in enumerate(weights)}
+    values |= {"elastic": int(kind == "elasticity"), "scale": scale, "n": len(F)}
+    return (vjp_kernel if backward else evaluate_kernel)(F.dtype), values
 
 
-def _scratch(F: Tensor) -> Tensor:
-    """Memory of this thread for intermediate values of a block."""
-    buffers = _memory.__dict__
-    if F.dtype not in buffers:
-        buffers[F.dtype] = F.new_empty(SCRATCH)
-    return buffers[F.dtype]
-
-
-def supported(device: torch.device, dtype: torch.dtype) -> bool:
-    """Whether these kernels run: on a CPU."""
-    return device.type == "cpu" and dtype in RANGE
-
-
-def new_cache(F: Tensor) -> Tensor:
-    """Memory (blocks, KEPT BLOCK) for the SVD and the outputs of F (n, 3, 3)."""
-    return F.new_empty(-(-len(F) // BLOCK), KEPT * BLOCK)
+def cache_shape(F: Tensor) -> tuple[int, int]:
+    """Shape (blocks, KEPT BLOCK) of memory for the SVD and the outputs of F (n, 3, 3)."""
+    return -(-len(F) // BLOCK), KEPT * BLOCK
 
 
 @torch.no_grad()
@@ -175,9 +160,8 @@ def evaluate(
     out = torch.empty_like(F) if out is None else out
     with contiguous(out) as (result,):
         if len(F):
-            W = [w.detach().contiguous() for w in weights]
-            inputs = F, *W, int(kind == "elasticity"), scale, len(F), cache, result, _scratch(F)
-            launch_blocks(evaluate_kernel(F.dtype), 1, 1, *inputs)
+            kernel, values = kernel_of(kind, scale, F, weights, False)
+            launch_blocks(kernel, 1, 1, F, *values.values(), int(cache is not None), cache, result)
     return out
 
 
@@ -198,18 +182,7 @@ def vjp(
     totals = tuple(torch.zeros_like(w) for w in weights) if grad_weights is None else grad_weights
     with contiguous(grad_F, *totals) as (result, *sums):
         if len(F):
-            W = [w.detach().contiguous() for w in weights]
-            inputs = (
-                F,
-                *W,
-                int(kind == "elasticity"),
-                scale,
-                len(F),
-                cache,
-                grad_out,
-                result,
-                *sums,
-                _scratch(F),
-            )
-            launch_blocks(vjp_kernel(F.dtype), 1, 1, *inputs)
+            kernel, values = kernel_of(kind, scale, F, weights, True)
+            cached = 0 if cache is None else 2
+            launch_blocks(kernel, 1, 1, F, *values.values(), cached, cache, 0, grad_out, result, *sums)
     return grad_F, totals

@@ -197,11 +197,11 @@ class _Pairs:
 class StructuredConstitutive(AdaptableConstitutive):
     """A network that corrects an analytic law. :mod:`structured_kernels` evaluates it, with `response` as reference."""
 
-    isotropic = True
     capturable = True
     native = True
     loops = True
     keeps_singular_values = True
+    shares_singular_values = True
     network_kernel: tuple[str, kernels.Constants]
     """Kind of the kernel, and the constants of the law."""
 

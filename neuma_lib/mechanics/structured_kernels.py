@@ -9,6 +9,7 @@ second kernel adds them in a fixed order.
 import math
 from dataclasses import dataclass
 from functools import cache
+from types import SimpleNamespace
 
 import torch
 import warp as wp
@@ -16,7 +17,7 @@ from torch import Tensor
 
 from neuma_lib.device import native_source
 from neuma_lib.mechanics.elasticity import STRETCH_MIN
-from neuma_lib.mechanics.fused_launch import block_count, contiguous, launch_blocks
+from neuma_lib.mechanics.fused_launch import addressed, block_count, contiguous, launch_blocks
 from neuma_lib.mechanics.law import Weights
 from neuma_lib.mechanics.singular_values_kernels import (
     CPU_WIDTH,
@@ -137,6 +138,12 @@ def add_source(kind: str, dtype: torch.dtype) -> str:
     return filled(TYPES + _constants(kind, dtype) + native_source(__file__, ".h")["add"] + END, dtype)
 
 
+def _own(dtype: torch.dtype) -> SimpleNamespace:
+    """Decorators of kernels, see `addressed`."""
+    integers = dict.fromkeys(("kind", "n", "cached", "adds"), int)
+    return addressed(**integers, **dict.fromkeys(("p0", "p1", "p2", "p3"), warp_types(dtype)[0]))
+
+
 @cache
 def evaluate_kernel(kind: str, dtype: torch.dtype):
     """Kernel (F, W0, W1, W2, index of the base, four constants, n, cached, cache, out), launched by `launch_blocks`.
@@ -144,19 +151,13 @@ def evaluate_kernel(kind: str, dtype: torch.dtype):
     If ``cached`` is 1, it writes the SVD to the cache (packs, CACHED, EVALUATE_WIDTH). If it is 3, F is the result of
     the return map that has written the cache.
     """
-    real, _, _ = warp_types(dtype)
+    own = _own(dtype)
 
-    @wp.func_native(source(kind, False, dtype))
-    def evaluate_rows(
-        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, kind: int, p0: real, p1: real, p2: real, p3: real,
-        n: int, cached: int, cache: wp.uint64, out: wp.uint64,
-    ): ...  # fmt: skip
+    @own.func_native(source(kind, False, dtype))
+    def evaluate_rows(F, W0, W1, W2, kind, p0, p1, p2, p3, n, cached, cache, out): ...
 
-    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
-    def structured_evaluate(
-        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, kind: int, p0: real, p1: real, p2: real, p3: real,
-        n: int, cached: int, cache: wp.uint64, out: wp.uint64,
-    ):  # fmt: skip
+    @own.kernel("unique", grid_stride=False)
+    def structured_evaluate(F, W0, W1, W2, kind, p0, p1, p2, p3, n, cached, cache, out):
         evaluate_rows(F, W0, W1, W2, kind, p0, p1, p2, p3, n, cached, cache, out)
 
     return structured_evaluate
@@ -169,20 +170,18 @@ def vjp_kernel(kind: str, dtype: torch.dtype):
     If ``cached`` is 2 or 3, it reads the SVD from the cache. If ``adds`` is 1, it adds to grad_F. It adds the gradients
     of the weights to three totals on a CPU, and writes them to partials (blocks, weights) on a GPU.
     """
-    real, _, _ = warp_types(dtype)
+    own = _own(dtype)
 
-    @wp.func_native(source(kind, True, dtype))
+    @own.func_native(source(kind, True, dtype))
     def vjp_rows(
-        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, kind: int, p0: real, p1: real, p2: real, p3: real,
-        n: int, cached: int, cache: wp.uint64, adds: int, grad_out: wp.uint64, grad_F: wp.uint64,
-        total0: wp.uint64, total1: wp.uint64, total2: wp.uint64, partials: wp.uint64,
+        F, W0, W1, W2, kind, p0, p1, p2, p3, n, cached, cache, adds, grad_out, grad_F, total0, total1, total2,
+        partials,
     ): ...  # fmt: skip
 
-    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
+    @own.kernel("unique", grid_stride=False)
     def structured_vjp(
-        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, kind: int, p0: real, p1: real, p2: real, p3: real,
-        n: int, cached: int, cache: wp.uint64, adds: int, grad_out: wp.uint64, grad_F: wp.uint64,
-        total0: wp.uint64, total1: wp.uint64, total2: wp.uint64, partials: wp.uint64,
+        F, W0, W1, W2, kind, p0, p1, p2, p3, n, cached, cache, adds, grad_out, grad_F, total0, total1, total2,
+        partials,
     ):  # fmt: skip
         vjp_rows(
             F, W0, W1, W2, kind, p0, p1, p2, p3, n, cached, cache, adds, grad_out, grad_F,
@@ -196,15 +195,13 @@ def vjp_kernel(kind: str, dtype: torch.dtype):
 def add_kernel(kind: str, dtype: torch.dtype):
     """CUDA kernel (partials (blocks, weights), their number, three totals) that adds the sums of blocks."""
 
-    @wp.func_native(add_source(kind, dtype))
-    def add_columns(
-        partials: wp.uint64, summands: int, total0: wp.uint64, total1: wp.uint64, total2: wp.uint64
-    ): ...
+    own = addressed(summands=int)
 
-    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
-    def structured_add(
-        partials: wp.uint64, summands: int, total0: wp.uint64, total1: wp.uint64, total2: wp.uint64
-    ):
+    @own.func_native(add_source(kind, dtype))
+    def add_columns(partials, summands, total0, total1, total2): ...
+
+    @own.kernel("unique", grid_stride=False)
+    def structured_add(partials, summands, total0, total1, total2):
         add_columns(partials, summands, total0, total1, total2)
 
     return structured_add

@@ -125,12 +125,12 @@ def identified_table(scenes: Sequence[Mapping[str, Any]]) -> tuple[str, str]:
     return as_csv([["scene", "family", "family_is", "constants", *COLUMNS], *rows]), "\n".join(text)
 
 
-def _kind(spec: Mapping[str, Mapping[str, Any]]) -> tuple[str, str, bool, str | None]:
-    """Names of both parts, whether a viscous flow has a yield stress, and name of a field."""
+def _kind(spec: Mapping[str, Mapping[str, Any]]) -> tuple[str, str, bool, str, str]:
+    """Names of both parts, whether a viscous flow has a yield stress, and names of a viscous part and a field."""
     plasticity = spec.get("plasticity") or {"name": "identity"}
     yields = plasticity["name"] == "viscous_flow" and plasticity.get("yield_stress", 0) > 0
-    field = (spec.get("field") or {"name": None})["name"]
-    return spec["elasticity"]["name"], plasticity["name"], yields, field
+    others = [(spec.get(part) or {"name": ""})["name"] for part in ("viscosity", "field")]
+    return spec["elasticity"]["name"], plasticity["name"], yields, *others
 
 
 def _listed(quantities: Sequence[Mapping], determined: bool) -> str:

@@ -97,8 +97,7 @@ def _laws(settings: Config) -> Iterator[tuple[str, dict[str, Any]]]:
     for group in ("families", "outside"):
         for name, family in getattr(settings.random, group).items():
             for end in (0, 1):
-                parts = {"elasticity": family.elasticity, "plasticity": family.plasticity}
-                yield f"random.{group}.{name}", {key: part.at(end) for key, part in parts.items()}
+                yield f"random.{group}.{name}", {key: part.at(end) for key, part in family.parts.items()}
 
 
 def _checked(where: str, spec: Mapping[str, Any], dt: float = 1.0) -> tuple[dict[str, Any] | None, list[str]]:

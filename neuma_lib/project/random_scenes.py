@@ -20,6 +20,7 @@ from neuma_lib.config.base import Section, Seed, Vector, internal, no_boolean
 from neuma_lib.config.dataset import CONVERGED
 from neuma_lib.config.laws import LawConfig
 from neuma_lib.errors import InputError
+from neuma_lib.mechanics.catalogue import viscous_stiffness
 
 Item = TypeVar("Item")
 
@@ -89,12 +90,12 @@ PositiveRange = Annotated[
 
 
 class DrawnPart(Section):
-    """One of the two parts of a law: its name, and ranges of its constants by name, sampled log-uniformly."""
+    """One of the parts of a law: its name, and ranges of its constants by name, sampled log-uniformly."""
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, PositiveRange]
 
-    name: str = Field(description="name of the elastic law or the return map")
+    name: str = Field(description="name of the elastic law, the return map or the viscous part")
 
     @property
     def ranges(self) -> dict[str, tuple[float, float]]:
@@ -115,6 +116,14 @@ class FamilyConfig(Section):
         description="elastic law, and minimum and maximum of each constant, for example E: [3e4, 3e5]"
     )
     plasticity: DrawnPart = Field(DrawnPart(name="identity"), description="the same of the return map")
+    viscosity: DrawnPart | None = Field(None, description="the same of the viscous part; null: none")
+
+    @property
+    def parts(self) -> dict[str, DrawnPart]:
+        """Given parts of the law, in the order in which they are drawn."""
+        return {
+            key: part for key in ("elasticity", "plasticity", "viscosity") if (part := getattr(self, key))
+        }
 
     @model_validator(mode="after")
     def _has_a_wave_speed(self) -> FamilyConfig:
@@ -287,7 +296,7 @@ def draw_one(
         "velocity": [uniform(bounds) for bounds in settings.velocity],
         "spin": [rounded(uniform(settings.spin) * n) for n in _direction(rng)],
         "duration": uniform(settings.duration),
-        "law": {"elasticity": part(family.elasticity), "plasticity": part(family.plasticity)},
+        "law": {key: part(drawn) for key, drawn in family.parts.items()},
         "density": DENSITY,
         "prior": family.prior,
         "story": f"drawn at random with seed {settings.seed}",
@@ -323,14 +332,18 @@ def rounded(value: float) -> float:
 
 def largest_stable(settings: RandomConfig, laws: Sequence[Mapping], grid: int) -> float | None:
     """The largest time step [s] that is stable for all laws, by the speed of pressure waves at small strains."""
-    moduli = [  # including fibres
-        part["E"] * (1 - part["nu"]) / ((1 + part["nu"]) * (1 - 2 * part["nu"]))
-        + part.get("fibre_modulus", 0.0)
-        for part in (law["elasticity"] for law in laws)
-        if {"E", "nu"} <= set(part)
-    ]
-    speed = math.sqrt(max(moduli) / DENSITY)
-    return max((dt for dt in settings.dt if speed * dt * grid <= settings.courant), default=None)
+
+    def courant(dt: float) -> float:
+        moduli = [  # including fibres and viscous parts
+            part["E"] * (1 - part["nu"]) / ((1 + part["nu"]) * (1 - 2 * part["nu"]))
+            + part.get("fibre_modulus", 0.0)
+            + (viscous_stiffness({**viscosity, "dt": dt}) if viscosity else 0.0)
+            for part, viscosity in ((law["elasticity"], law.get("viscosity")) for law in laws)
+            if {"E", "nu"} <= set(part)
+        ]
+        return math.sqrt(max(moduli) / DENSITY) * dt * grid
+
+    return max((dt for dt in settings.dt if courant(dt) <= settings.courant), default=None)
 
 
 def _rejection(settings: RandomConfig, scene: Mapping[str, Any], gravity: Vector) -> str | None:

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from neuma_lib.errors import NonFiniteError
@@ -69,6 +68,8 @@ def predict(
 
 def nearest_body(start: State, points: Tensor) -> Tensor:
     """Index of the body whose particle is nearest to each point (M, 3) [m], shape (M,)."""
+    from scipy.spatial import cKDTree  # here, because the import takes an eighth of a second
+
     owners = torch.arange(len(start.bodies)).repeat_interleave(torch.tensor(start.bodies))
     nearest = cKDTree(start.x.detach().cpu().numpy()).query(points.detach().cpu().numpy())[1]
     return owners[torch.from_numpy(nearest)]

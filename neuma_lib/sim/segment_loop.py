@@ -22,6 +22,8 @@ from neuma_lib.sim.workspace import Workspace
 
 PARTICLE_STEPS = 1_000_000
 """Particles times steps in one call, which takes up to 0.3 s on a slow core. Signals wait for its end."""
+SLOWER = 8
+"""Factor for networks."""
 
 Parts = Mapping[str, Sequence[tuple[Constitutive, slice, Weights]]]
 """For elasticity and plasticity: law, particles and weights of each region."""
@@ -85,7 +87,8 @@ class SegmentLoop:
         self._flowing = not self._elastic
         self._memory: list[Any] = []  # arguments of the kernels
         self._caches = self._new_caches(cache_bytes)
-        self._per_call = max(1, PARTICLE_STEPS // ws.size.particles)
+        fast = all(law.native_rows for regions in parts.values() for law, _, _ in regions)
+        self._per_call = max(1, PARTICLE_STEPS // (1 if fast else SLOWER) // ws.size.particles)
         self._partials: dict[tuple[str, int], Tensor] = {}  # of analytic laws in the steps of a call
         self._sums: dict[tuple[str, int], Weights] = {}  # gradients of rows of coefficients, or of weights
         last = [] if tracers is None else [tracers]
@@ -199,30 +202,32 @@ class SegmentLoop:
     def _new_caches(self, cache_bytes: float) -> dict[tuple[str, int], Tensor]:
         """Memory for singular values by part and region, which later rollouts of the workspace use again.
 
-        A return map and the stress after it at once use that of the return map.
+        A return map and the stress after it use that of the return map if both can.
         """
         ws, caches = self._ws, {}
         for k in self._regions:
-            elastic, plastic = (self._parts[part][k][0] for part in ("elasticity", "plasticity"))
-            part = "elasticity" if not self._flowing or self._is_separate(k) else "plasticity"
-            law, here, weights = self._parts[part][k]
-            keeps = ws.size.differentiable and (
-                elastic.keeps_singular_values or part == "plasticity" and plastic.keeps_singular_values
-            )
-            shared = part == "plasticity" and not self._is_analytic(k)
-            if not keeps and not shared:
-                continue
-            one = law.cache_shape(ws.F[0][here], weights)
-            shape = (ws.size.n_cached_steps, *one)
-            needed = math.prod(shape) * ws.F.element_size() if self._caches_steps else 0
-            if needed > cache_bytes and shared:
-                shape, needed = (1, *one), 0
-            if needed <= cache_bytes:
-                cache_bytes -= needed
-                key = "segment", part, k, shape
-                if key not in ws.law_caches:
-                    ws.law_caches[key] = ws.F.new_empty(shape)
-                caches[part, k] = ws.law_caches[key]
+            elastic, plastic = laws = [self._parts[part][k][0] for part in ("elasticity", "plasticity")]
+            together = self._flowing and not self._is_separate(k)
+            shared = together and not self._is_analytic(k)
+            users = {"plasticity": laws} if together else {"elasticity": [elastic]}
+            if self._flowing and not together and not plastic.native_rows:
+                users["plasticity"] = [plastic]
+            for part, own in users.items():
+                keeps = ws.size.differentiable and any(law.keeps_singular_values for law in own)
+                if not keeps and not shared:
+                    continue
+                law, here, weights = self._parts[part][k]
+                one = law.cache_shape(ws.F[0][here], weights)
+                shape = (ws.size.n_cached_steps, *one)
+                needed = math.prod(shape) * ws.F.element_size() if self._caches_steps else 0
+                if needed > cache_bytes and shared:
+                    shape, needed = (1, *one), 0
+                if needed <= cache_bytes:
+                    cache_bytes -= needed
+                    key = "segment", part, k, shape
+                    if key not in ws.law_caches:
+                        ws.law_caches[key] = ws.F.new_empty(shape)
+                    caches[part, k] = ws.law_caches[key]
         return caches
 
     def _stresses(self) -> list[Repeated]:
@@ -305,7 +310,8 @@ class SegmentLoop:
 
     def _is_separate(self, k: int) -> bool:
         """Whether the return map of a region has no singular values for the kernel of its stress."""
-        return not self._is_analytic(k) and self._parts["plasticity"][k][0].native_rows
+        reads = all(self._parts[part][k][0].shares_singular_values for part in ("elasticity", "plasticity"))
+        return not self._is_analytic(k) and not reads
 
     def _is_analytic(self, k: int) -> bool:
         """Whether one kernel has the return map and the stress of a region."""

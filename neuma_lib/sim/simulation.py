@@ -118,7 +118,8 @@ class Simulation:
         self._segment_in_memory = 0
         self._weight_slices = weight_slices
         laws = [getattr(region.law, part) for region in regions for part in PARTS]
-        self._uses_graphs = x.device.type == "cuda" and all(law.capturable for law in laws)
+        single = x.dtype == torch.float32  # float64 on a GPU is for comparisons only
+        self._uses_graphs = x.device.type == "cuda" and single and all(law.capturable for law in laws)
         self._loops = self.workspace.native and all(law.loops for law in laws)
         self._loop: SegmentLoop | None = None
         self.errors: list[NonFiniteError | None] = [None] * copies

@@ -37,7 +37,7 @@ import re
 import torch
 import warp as wp
 
-from neuma_lib.device import launch, native_source, sort_pairs, start_warp
+from neuma_lib.device import launch, native_source, sort_pairs, start_warp, typed
 from neuma_lib.errors import InputError
 from neuma_lib.splatting.compositing import Settings
 from neuma_lib.splatting.projection import CULLED
@@ -281,68 +281,65 @@ def source(name: str, tile: int, lane_pixels: int, compares: bool = False, opaci
     return text
 
 
+ARGUMENTS = {
+    **dict.fromkeys(("tile", "thread", "width", "height"), int),
+    **dict.fromkeys(("alpha_min", "alpha_max", "transmittance_min"), float),
+    "splats": wp.array3d(dtype=float),  # (I, G, SPLAT_SIZE)
+    "ids": wp.array(dtype=int),  # (N,)
+    "starts": wp.array(dtype=int),  # (tiles + 1,)
+    "background": wp.array(dtype=float),  # (3,)
+    "pictures": wp.array4d(dtype=float),  # (I, H, W, 3), out
+    "alphas": wp.array3d(dtype=float),  # (I, H, W), out
+    "transmittances": wp.array3d(dtype=float),  # (I, H, W), out; undefined in tiles without splats
+    "observed": wp.array3d(dtype=int),  # (I, H, W)
+    "sums": wp.array2d(dtype=wp.float64),  # (tiles, warps), out
+    "states": wp.array3d(dtype=float),  # (tiles, pixels, 4), out; undefined in tiles without splats
+    "scales": wp.array(dtype=float),  # (I,)
+    "grad_pictures": wp.array4d(dtype=float),  # (I, H, W, 3)
+    "grad_alphas": wp.array3d(dtype=float),  # (I, H, W)
+    "grad_splats": wp.array3d(dtype=float),  # (I, G, SPLAT_SIZE), out: sums for `finish`, added
+}
+"""Types of the arguments of the kernels below by name. They are launched with a block of threads per tile, on CUDA
+only. All threads of a block must enter, so that warps are complete."""
+
+
 @functools.cache
 def kernels(tile: int, lane_pixels: int):
-    """``(composite, composite_adjoint, threads)``: Warp kernels, launched with a block of ``threads`` per tile.
-
-    CUDA only. All threads of a block must enter, so that warps are complete.
-    """
-    module = wp.get_module(f"{__name__}.tile{tile}x{lane_pixels}")
+    """``(composite, composite_adjoint, threads)`` for blocks of ``threads``."""
     threads = tile * tile // lane_pixels
+    own = typed(
+        ARGUMENTS | {"stops": wp.array3d(dtype=int)}
+    )  # (I, H, W), out; undefined in tiles without splats
+    kernel = own.kernel(wp.get_module(f"{__name__}.tile{tile}x{lane_pixels}"), launch_bounds=threads)
 
-    @wp.func_native(source("forward", tile, lane_pixels))
+    @own.func_native(source("forward", tile, lane_pixels))
     def composite_patch(
-        tile: int, thread: int, width: int, height: int,
-        splats: wp.array3d(dtype=float), ids: wp.array(dtype=int), starts: wp.array(dtype=int),
-        alpha_min: float, alpha_max: float, transmittance_min: float, background: wp.array(dtype=float),
-        pictures: wp.array4d(dtype=float), alphas: wp.array3d(dtype=float),
-        transmittances: wp.array3d(dtype=float), stops: wp.array3d(dtype=int),
+        tile, thread, width, height, splats, ids, starts, alpha_min, alpha_max, transmittance_min, background,
+        pictures, alphas, transmittances, stops,
     ): ...  # fmt: skip
 
-    @wp.func_native(source("backward", tile, lane_pixels))
+    @own.func_native(source("backward", tile, lane_pixels))
     def composite_patch_adjoint(
-        tile: int, thread: int, width: int, height: int,
-        splats: wp.array3d(dtype=float), ids: wp.array(dtype=int), starts: wp.array(dtype=int),
-        transmittances: wp.array3d(dtype=float), stops: wp.array3d(dtype=int),
-        alpha_min: float, alpha_max: float, background: wp.array(dtype=float),
-        grad_pictures: wp.array4d(dtype=float), grad_alphas: wp.array3d(dtype=float),
-        grad_splats: wp.array3d(dtype=float),
+        tile, thread, width, height, splats, ids, starts, transmittances, stops, alpha_min, alpha_max, background,
+        grad_pictures, grad_alphas, grad_splats,
     ): ...  # fmt: skip
 
-    @wp.kernel(module=module, enable_backward=False, launch_bounds=threads)
+    @kernel
     def composite(
-        splats: wp.array3d(dtype=float),  # (I, G, SPLAT_SIZE)
-        ids: wp.array(dtype=int),  # (N,)
-        starts: wp.array(dtype=int),  # (tiles + 1,)
-        alpha_min: float,
-        alpha_max: float,
-        transmittance_min: float,
-        background: wp.array(dtype=float),  # (3,)
-        pictures: wp.array4d(dtype=float),  # (I, H, W, 3), out
-        alphas: wp.array3d(dtype=float),  # (I, H, W), out
-        transmittances: wp.array3d(dtype=float),  # (I, H, W), out; undefined in tiles without splats
-        stops: wp.array3d(dtype=int),  # (I, H, W), out; undefined in tiles without splats
-    ):
+        splats, ids, starts, alpha_min, alpha_max, transmittance_min, background, pictures, alphas, transmittances,
+        stops,
+    ):  # fmt: skip
         i = wp.tid()
         composite_patch(
             i // threads, i % threads, alphas.shape[2], alphas.shape[1], splats, ids, starts, alpha_min, alpha_max,
             transmittance_min, background, pictures, alphas, transmittances, stops,
         )  # fmt: skip
 
-    @wp.kernel(module=module, enable_backward=False, launch_bounds=threads)
+    @kernel
     def composite_adjoint(
-        splats: wp.array3d(dtype=float),  # (I, G, SPLAT_SIZE)
-        ids: wp.array(dtype=int),  # (N,)
-        starts: wp.array(dtype=int),  # (tiles + 1,)
-        transmittances: wp.array3d(dtype=float),  # (I, H, W)
-        stops: wp.array3d(dtype=int),  # (I, H, W)
-        alpha_min: float,
-        alpha_max: float,
-        background: wp.array(dtype=float),  # (3,)
-        grad_pictures: wp.array4d(dtype=float),  # (I, H, W, 3)
-        grad_alphas: wp.array3d(dtype=float),  # (I, H, W)
-        grad_splats: wp.array3d(dtype=float),  # (I, G, SPLAT_SIZE), out: sums for `finish`, added
-    ):
+        splats, ids, starts, transmittances, stops, alpha_min, alpha_max, background, grad_pictures, grad_alphas,
+        grad_splats,
+    ):  # fmt: skip
         i = wp.tid()
         composite_patch_adjoint(
             i // threads, i % threads, grad_alphas.shape[2], grad_alphas.shape[1], splats, ids, starts,
@@ -355,32 +352,20 @@ def kernels(tile: int, lane_pixels: int):
 @functools.cache
 def comparing_kernel(tile: int, lane_pixels: int):
     """``(compare, threads)``: as `kernels`, for the comparison with observed pixels."""
-    module = wp.get_module(f"{__name__}.tile{tile}x{lane_pixels}.compare")
     threads = tile * tile // lane_pixels
+    own = typed(ARGUMENTS | {"stops": wp.array2d(dtype=int)})  # (tiles, pixels), as above
+    kernel = own.kernel(wp.get_module(f"{__name__}.tile{tile}x{lane_pixels}.compare"), launch_bounds=threads)
 
-    @wp.func_native(source("forward", tile, lane_pixels, compares=True))
+    @own.func_native(source("forward", tile, lane_pixels, compares=True))
     def compare_patch(
-        tile: int, thread: int, width: int, height: int,
-        splats: wp.array3d(dtype=float), ids: wp.array(dtype=int), starts: wp.array(dtype=int),
-        alpha_min: float, alpha_max: float, transmittance_min: float, background: wp.array(dtype=float),
-        observed: wp.array3d(dtype=int), sums: wp.array2d(dtype=wp.float64),
-        states: wp.array3d(dtype=float), stops: wp.array2d(dtype=int),
+        tile, thread, width, height, splats, ids, starts, alpha_min, alpha_max, transmittance_min, background,
+        observed, sums, states, stops,
     ): ...  # fmt: skip
 
-    @wp.kernel(module=module, enable_backward=False, launch_bounds=threads)
+    @kernel
     def compare(
-        splats: wp.array3d(dtype=float),  # (I, G, SPLAT_SIZE)
-        ids: wp.array(dtype=int),  # (N,)
-        starts: wp.array(dtype=int),  # (tiles + 1,)
-        alpha_min: float,
-        alpha_max: float,
-        transmittance_min: float,
-        background: wp.array(dtype=float),  # (3,)
-        observed: wp.array3d(dtype=int),  # (I, H, W)
-        sums: wp.array2d(dtype=wp.float64),  # (tiles, warps), out
-        states: wp.array3d(dtype=float),  # (tiles, pixels, 4), out; undefined in tiles without splats
-        stops: wp.array2d(dtype=int),  # (tiles, pixels), out; undefined in tiles without splats
-    ):
+        splats, ids, starts, alpha_min, alpha_max, transmittance_min, background, observed, sums, states, stops,
+    ):  # fmt: skip
         i = wp.tid()
         compare_patch(
             i // threads, i % threads, observed.shape[2], observed.shape[1], splats, ids, starts, alpha_min, alpha_max,
@@ -393,33 +378,20 @@ def comparing_kernel(tile: int, lane_pixels: int):
 @functools.cache
 def comparing_adjoint(tile: int, lane_pixels: int, opacities: bool):
     """``(compare_adjoint, threads)``, with or without the sum for gradients of opacities."""
-    module = wp.get_module(f"{__name__}.tile{tile}x{lane_pixels}.compare_adjoint{int(opacities)}")
     threads = tile * tile // lane_pixels
+    own = typed(ARGUMENTS | {"stops": wp.array2d(dtype=int)})  # (tiles, pixels), as above
+    module = wp.get_module(f"{__name__}.tile{tile}x{lane_pixels}.compare_adjoint{int(opacities)}")
 
-    @wp.func_native(source("backward", tile, lane_pixels, True, opacities))
+    @own.func_native(source("backward", tile, lane_pixels, True, opacities))
     def compare_patch_adjoint(
-        tile: int, thread: int, width: int, height: int,
-        splats: wp.array3d(dtype=float), ids: wp.array(dtype=int), starts: wp.array(dtype=int),
-        states: wp.array3d(dtype=float), stops: wp.array2d(dtype=int),
-        alpha_min: float, alpha_max: float, background: wp.array(dtype=float),
-        scales: wp.array(dtype=float), grad_splats: wp.array3d(dtype=float),
+        tile, thread, width, height, splats, ids, starts, states, stops, alpha_min, alpha_max, background, scales,
+        grad_splats,
     ): ...  # fmt: skip
 
-    @wp.kernel(module=module, enable_backward=False, launch_bounds=threads)
+    @own.kernel(module, launch_bounds=threads)
     def compare_adjoint(
-        splats: wp.array3d(dtype=float),  # (I, G, SPLAT_SIZE)
-        ids: wp.array(dtype=int),  # (N,)
-        starts: wp.array(dtype=int),  # (tiles + 1,)
-        states: wp.array3d(dtype=float),  # (tiles, pixels, 4)
-        stops: wp.array2d(dtype=int),  # (tiles, pixels)
-        alpha_min: float,
-        alpha_max: float,
-        background: wp.array(dtype=float),  # (3,)
-        width: int,
-        height: int,
-        scales: wp.array(dtype=float),  # (I,)
-        grad_splats: wp.array3d(dtype=float),  # (I, G, SPLAT_SIZE), out: sums for `finish`, added
-    ):
+        splats, ids, starts, states, stops, alpha_min, alpha_max, background, width, height, scales, grad_splats,
+    ):  # fmt: skip
         i = wp.tid()
         compare_patch_adjoint(
             i // threads, i % threads, width, height, splats, ids, starts, states, stops, alpha_min, alpha_max,

@@ -16,7 +16,6 @@ import torch
 import warp as wp
 
 from neuma_lib.device import launch, start_warp
-from neuma_lib.splatting import projection_cpu
 from neuma_lib.splatting.records import SPLAT_SIZE, functions
 from neuma_lib.splatting.spherical_harmonics import SH_C0, SH_C1, SH_C2, SH_C3
 
@@ -45,12 +44,9 @@ def project(means, covars, opacities, sh, viewmats, Ks, settings, empty) -> tupl
     """
     shape = (len(means) * len(viewmats), means.shape[1])
     splats, depths = empty("splats", (*shape, SPLAT_SIZE), means), empty("depths", shape, means)
-    if means.device.type == "cpu":
-        kernel, dim = _on_cpu(means)[0], _packs(means)
-    else:
-        kernel, dim = kernels(means.dtype)[0], shape
+    kernel, _, _ = kernels(means.dtype)
     launch(
-        kernel, dim, means, covars, opacities, sh, viewmats, Ks, settings.width, settings.height, settings.eps2d,
+        kernel, shape, means, covars, opacities, sh, viewmats, Ks, settings.width, settings.height, settings.eps2d,
         settings.alpha_min, splats, depths,
     )  # fmt: skip
     return splats, depths
@@ -61,23 +57,12 @@ def geometry_adjoint(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Gradients of means (T, G, 3) and covariances (T, G, 3, 3) from those of the splats."""
     grad_means, grad_covars = torch.empty_like(means), torch.empty_like(covars)
-    if means.device.type == "cpu":
-        kernel, dim = _on_cpu(means)[1], _packs(means)
-    else:
-        kernel, dim = kernels(means.dtype)[1], means.shape[:2]
+    _, kernel, _ = kernels(means.dtype)
     launch(
-        kernel, dim, means, covars, sh, viewmats, Ks, settings.width, settings.height, splats, depths,
+        kernel, means.shape[:2], means, covars, sh, viewmats, Ks, settings.width, settings.height, splats, depths,
         grad_splats, grad_means, grad_covars,
     )  # fmt: skip
     return grad_means, grad_covars
-
-
-def _on_cpu(means: torch.Tensor):
-    return projection_cpu.kernels(means.dtype, NEAR_PLANE, REACH_SLACK, UNLIMITED, CULLED)
-
-
-def _packs(means: torch.Tensor) -> int:
-    return -(-means.shape[1] // projection_cpu.LANES)
 
 
 def appearance_adjoint(means, sh, viewmats, splats, depths, grad_splats) -> tuple[torch.Tensor, torch.Tensor]:
@@ -90,7 +75,7 @@ def appearance_adjoint(means, sh, viewmats, splats, depths, grad_splats) -> tupl
 
 @functools.cache
 def kernels(dtype: torch.dtype):
-    """``(project, geometry_adjoint, appearance_adjoint)`` kernels of a dtype; a CPU has its own first two.
+    """``(project, geometry_adjoint, appearance_adjoint)`` kernels of a dtype.
 
     The adjoint has two parts, because training a material needs the first one only. It has a thread per Gaussian and
     frame. In the second, a thread sums over all images of a Gaussian, without atomics. Loops over harmonics have a

@@ -1,9 +1,8 @@
 """Differentiable Gaussian splatting of a batch of frames (paper Sec. 3.3 and the supplement's 3DGS).
 
 One autograd function contains projection and compositing, Warp kernels with hand-written adjoints. CPUs composite splat
-by splat (``compositor_cpu``), GPUs tile by tile (``compositor_cuda``). ``gsplat_backend`` uses the gsplat package
-instead. If only the squared error is needed, the compositor compares with the observation directly
-(``rasterized_error``).
+by splat (``compositor_cpu``), GPUs tile by tile (``compositor_cuda``). If only the squared error is needed, the
+compositor compares with the observation directly (``rasterized_error``).
 """
 
 from __future__ import annotations

@@ -81,6 +81,44 @@ def test_exposure_is_found_exactly_and_outside_what_moves():
     np.testing.assert_allclose(offset, 4, atol=0.8)
 
 
+def exposure_of_each_pixel(seen, empty):
+    """The slow twin of `match_exposure` for one channel: without counts of equal levels."""
+    seen, empty = seen.ravel().astype(float), empty.ravel().astype(float)
+    valid = (seen > 4) & (seen < 251) & (empty > 4) & (empty < 251)
+    seen, empty = seen[valid], empty[valid]
+    residual = np.abs(seen - np.median(seen / empty) * empty)
+    kept = residual <= np.quantile(residual, 0.6)
+    for _ in range(8):
+        x, y = empty[kept], seen[kept]
+        gain = np.cov(x, y)[0, 1] / x.var(ddof=1) if x.std() > 4 else y.mean() / x.mean()
+        offset = y.mean() - gain * x.mean()
+        residual = np.abs(seen - gain * empty - offset)
+        kept = residual <= max(2.0, 3 * 1.4826 * np.median(residual))
+    return gain, offset
+
+
+@pytest.mark.parametrize("spread", [3, 60], ids=["one brightness", "texture"])
+def test_exposure_is_that_of_a_fit_to_each_pixel(spread):
+    rng = np.random.default_rng(4)
+    background = np.clip(rng.normal(120, spread, (60, 80, 3)), 0, 255).astype(np.uint8)
+    frame = background * [1.1, 0.8, 0.95] + [-6, 5, 2] + rng.normal(0, 2, background.shape)
+    frame[:25, :40] = (30, 90, 200)
+    frame = np.clip(frame, 0, 255).round().astype(np.uint8)
+    gains, offsets = backgrounds.match_exposure(frame, background)
+    for c in range(3):
+        expected = exposure_of_each_pixel(frame[..., c], background[..., c])
+        np.testing.assert_allclose((gains[c], offsets[c]), expected, rtol=1e-9, atol=1e-9)
+
+
+def test_a_weighted_quantile_is_that_of_repeated_values():
+    rng = np.random.default_rng(0)
+    for size in (1, 2, 7, 40):
+        values, counts = rng.normal(size=size), rng.integers(1, 5, size)
+        for share in (0, 0.3, 0.5, 0.6, 1):
+            expected = np.quantile(np.repeat(values, counts), share)
+            assert backgrounds.weighted_quantile(values, counts, share) == pytest.approx(expected, abs=1e-12)
+
+
 def test_a_shadow_is_distinguished_from_a_dark_object():
     background = texture()
     shaded = np.where(ellipse((80, 120), 40, 40)[..., None], 0.6 * background, background)

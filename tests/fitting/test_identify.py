@@ -107,6 +107,23 @@ def test_constants_and_family_of_the_truth_are_identified():
     assert identified.as_dict()["law"]["plasticity"] == {"name": "identity"}
 
 
+@pytest.mark.parametrize("true", ["kelvin_voigt", "maxwell"])
+def test_a_viscous_part_is_identified(true):
+    """With its constants, among an elastic solid, a fluid and the other viscous part."""
+    constants = {
+        "kelvin_voigt": ({"viscosity": 60.0}, {"viscosity": 20.0}),
+        "maxwell": ({"modulus": 1e4, "relaxation": 0.02}, {"modulus": 5e3, "relaxation": 0.05}),
+    }
+    families = {"hencky": ELASTIC, "fluid": FLUID}
+    for name, (_, guess) in constants.items():
+        families[name] = {"elasticity": ELASTIC["elasticity"], "viscosity": {"name": name, **guess}}
+    truth, own = {"elasticity": {"name": "hencky", "E": 1.5e4, "nu": 0.35}}, constants[true][0]
+    identified = identified_in(truth | {"viscosity": {"name": true, **own}}, families)
+    assert identified.best.family.name == true and identified.ties == []
+    expected = {"E": 1.5e4, "nu": 0.35, **own}
+    assert identified.best.values == pytest.approx(expected, rel=0.03)
+
+
 def test_held_out_frames_select_the_family():
     """The first frames are of one family, and fit it better. The last frames are those that the fit of the other one
     predicts, which is therefore selected. Fits to the first frames do not depend on the last ones."""

@@ -11,12 +11,10 @@ from neuma_lib.config.training import TrainingConfig
 from neuma_lib.fitting.frame_batches import first_contact, held_out_frames
 from neuma_lib.fitting.material import ParticleLoss, PixelLoss, Stretch, train_material
 from neuma_lib.fitting.structured_fit import (
-    TOLERANCE,
     Score,
     _select,
     first_informative_frame,
     from_frame,
-    largest_similar,
     rival_bases,
     subsets,
     train_structured,
@@ -265,20 +263,6 @@ def test_rivals_are_ties_with_other_return_maps_the_best_first():
     assert rival_bases(results, 3) == [law("viscous_flow"), law("identity")]
     assert rival_bases(results, 1) == [law("viscous_flow")]
     assert rival_bases(results, 0) == [] == rival_bases({**results, "ties": []}, 1)
-
-
-def test_the_largest_penalty_with_a_similar_held_out_loss_is_selected(problem):
-    """A very large weight leaves the law at its base, which does not fit these frames."""
-    messages = []
-    structured = STRUCTURED.model_copy(update={"penalties": (1e-9, 1e9)})
-    spec = {"elasticity": FLOWS["elasticity"]}
-    trained, choice = fit(problem, spec, structured=structured, log=messages.append)
-    assert set(choice.trials) == {"nothing", "elastic", "elastic, penalty 1e-09", "elastic, penalty 1e+09"}
-    assert choice.penalty == 1e-9 == choice.as_dict()["penalty"] and any("1e-09" in line for line in messages)
-    free, held = (choice.trials[f"elastic{w}"].held_out_loss for w in ("", ", penalty 1e+09"))
-    assert held > (1 + TOLERANCE) * free and trained.best_loss < trained.history.loss[0]
-    assert largest_similar({0.0: 1.0, 0.1: 1 + TOLERANCE / 2, 1.0: 1 + 2 * TOLERANCE}) == 0.1
-    assert largest_similar({0.0: 1.0, 0.1: 0.9, 1.0: float("inf")}) == 0.1
 
 
 def test_some_frames_of_a_loss_are_those_of_the_loss(problem):

@@ -21,7 +21,7 @@ from neuma_lib.sim import rollout as rollouts
 from neuma_lib.sim.model import MPM
 from tests.support.deformations import EYE, NU, E, deformations, hencky_deviator, rotations
 from tests.support.emulated_cuda import COMPILER, EmulatedAnalyticLaws
-from tests.support.fused_laws import assert_can_be_captured, distance, probe
+from tests.support.fused_laws import assert_can_be_captured, distance, fast, probe, twin
 from tests.support.sim_scenes import moving_cube
 
 pytestmark = pytest.mark.core
@@ -92,17 +92,6 @@ def states(name: str) -> torch.Tensor:
     special = torch.diag_embed(torch.tensor(special, dtype=torch.float64))
     F = torch.cat([deformations(50), rotations(len(special), 6) @ special @ rotations(len(special), 7)])
     return F if name in PLASTIC else torch.cat([F, rotations(5, 8)])
-
-
-def twin(part, F, weights, g):
-    """Result, gradient of F and of the weights by torch."""
-    grad_F, grads = Constitutive.vjp(part, F, weights, g)
-    return [Constitutive.evaluate(part, F, weights), grad_F, *grads]
-
-
-def fast(part, F, weights, g):
-    grad_F, grads = part.vjp(F, weights, g)
-    return [part.evaluate(F, weights), grad_F, *grads]
 
 
 def test_all_built_in_laws_have_kernels():

@@ -432,31 +432,6 @@ def test_constants_given_as_tensors_are_fitted():
         assert_adjoint(part, deformations(50))
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("kind", ["elasticity", "plasticity"])
-@pytest.mark.parametrize("count", [1, 33, 2053])
-@pytest.mark.parametrize("fused", [None, False])
-def test_network_equals_its_torch_twin(kind, fused, count, dtype):
-    """Both hand-written forms and their adjoints, with and without cache, against autograd through the obvious code."""
-    part = getattr(neural_law(seed=2), kind)
-    part.fused = fused
-    F = deformations(count).to(dtype)
-    probe = torch.randn(F.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(dtype)
-    weights = weights_of(part, dtype)
-    value, cache = part.evaluate_with_cache(F, weights)
-    twin_value = part.response(F, weights)
-    twin_F, twin_weights = Constitutive.vjp(part, F, weights, probe)
-    eps = torch.finfo(dtype).eps
-    assert float((value - twin_value).abs().max()) < 64 * eps * float(twin_value.abs().max())
-    assert torch.equal(part.evaluate(F, weights), value)
-    for kept in (None, cache):
-        grad_F, grad_weights = part.vjp(F, weights, probe, cache=kept)
-        assert float((grad_F - twin_F).abs().max()) < 256 * eps * float(twin_F.abs().max())
-        for grad, twin in zip(grad_weights, twin_weights, strict=True):
-            # sums over all rows
-            assert float((grad - twin).abs().max()) < 64 * eps * count**0.5 * float(twin.abs().max())
-
-
 def test_buffers_are_filled_and_weight_gradients_accumulate():
     part = neural_law(seed=2).elasticity
     F, weights = deformations(40), weights_of(part)

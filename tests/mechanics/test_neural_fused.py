@@ -5,6 +5,7 @@ import torch
 
 from neuma_lib.mechanics import neural_fused as fused
 from neuma_lib.mechanics.neural import neural_law
+from tests.support import fused_laws
 from tests.support.emulated_cuda import COMPILER, EmulatedLaws
 from tests.support.fused_laws import assert_can_be_captured, distance, probe
 
@@ -36,11 +37,7 @@ def law_part(kind):
 def twin(part, F, g, dtype):
     """Result, gradient of F and gradients of the weights by the twin, in float64."""
     weights = tuple(w.to(F.device, dtype) for w in part.weights())
-    F, g = F.to(dtype), g.to(dtype)
-    part.fused = False
-    value = part.evaluate(F, weights)
-    grad_F, grad_weights = part.vjp(F, weights, g)
-    return [x.double() for x in (value, grad_F, *grad_weights)]
+    return [x.double() for x in fused_laws.twin(part, F.to(dtype), weights, g.to(dtype))]
 
 
 @pytest.fixture(scope="module")
@@ -128,10 +125,7 @@ def test_fused_is_as_near_to_float64_as_the_float32_twin(kind, regime, n):
     part, F = law_part(kind), deformations(regime, n)
     g = probe(F)
     F32, weights, g32 = on_gpu(part, F, g)
-    assert part.uses_fused(F32)
-    value = part.evaluate(F32, weights)
-    grad_F, grad_weights = part.vjp(F32, weights, g32)
-    actual = [x.double() for x in (value, grad_F, *grad_weights)]
+    actual = [x.double() for x in fused_laws.fast(part, F32, weights, g32)]
     truth, plain = (twin(part, F.cuda(), g.cuda(), dtype) for dtype in (torch.float64, torch.float32))
     for exact, slow, fast in zip(truth, plain, actual, strict=True):
         assert distance(fast, exact) < 5 * distance(slow, exact) + 1e-7

@@ -3,12 +3,11 @@
 import pytest
 import torch
 
-from neuma_lib.mechanics.law import Constitutive
 from neuma_lib.mechanics.plasticity import hencky_strain
 from neuma_lib.mechanics.structured_kernels import STRAIN
 from tests.support.deformations import rotations
 from tests.support.emulated_cuda import COMPILER, EmulatedStructuredLaws
-from tests.support.fused_laws import assert_can_be_captured, distance, probe
+from tests.support.fused_laws import assert_can_be_captured, distance, fast, probe, twin
 from tests.support.structured_laws import (
     ELASTIC,
     RETURNS,
@@ -49,17 +48,6 @@ def states(name):
 def gain(weights):
     """Largest change of the network's outputs by a change of the strains."""
     return float(torch.stack([torch.linalg.matrix_norm(w.double(), 2) for w in weights]).prod()) / STRAIN
-
-
-def twin(part, F, weights, g):
-    """Result, gradient of F and of the weights by torch."""
-    grad_F, grads = Constitutive.vjp(part, F, weights, g)
-    return [Constitutive.evaluate(part, F, weights), grad_F, *grads]
-
-
-def fast(part, F, weights, g):
-    grad_F, grads = part.vjp(F, weights, g)
-    return [part.evaluate(F, weights), grad_F, *grads]
 
 
 def rounding(part, F, weights, g):

@@ -145,13 +145,13 @@ class TestMemory:
             assert (other[2] - picture).abs().max() < 1e-13
 
     def test_memory_does_not_grow_with_the_picture(self, carried, monkeypatch):
-        """Nine times as many rays; rendered at once they keep nearly nine times as much."""
+        """Nine times as many rays; rendered at once they keep over six times as much."""
         videos, kept = [Video(self.video(carried, size)) for size in (24, 72)], {}
         for most in (500, 10**9):
             monkeypatch.setitem(rendering.POINTS_AT_ONCE, "cpu", most)
             kept[most] = [self.error(carried, video)[2] for video in videos]
         assert kept[500][1] < 1.05 * kept[500][0] < kept[10**9][0]
-        assert kept[10**9][1] > 7 * kept[10**9][0]
+        assert kept[10**9][1] > 6 * kept[10**9][0]
 
     def test_a_video_stays_in_bytes(self, carried):
         seen = self.video(carried, 24)

@@ -22,6 +22,7 @@ VISCOUS = {
     "plasticity": {"name": "viscous_flow", "viscosity": 100.0, "yield_stress": 0.0},
 }
 BINGHAM = {**VISCOUS, "plasticity": {**VISCOUS["plasticity"], "yield_stress": 50.0}}
+DAMPED = {**HENCKY, "viscosity": {"name": "kelvin_voigt", "viscosity": 100.0}}
 LAWS = {"hencky": HENCKY, "neo_hookean": NEO_HOOKEAN, "viscous_flow": VISCOUS, "bingham": BINGHAM}
 
 
@@ -51,6 +52,7 @@ def scene(truth, family, ties=(), group="all", converged=False, **quantities):
         (VISCOUS, "viscous_flow", [], RIGHT),
         (VISCOUS, "bingham", [], WRONG),  # the truth has no yield stress
         (BINGHAM, "viscous_flow", ["bingham"], TIE),
+        (DAMPED, "hencky", [], WRONG),
     ],
 )
 def test_the_family_is_scored_by_its_laws(truth, family, ties, verdict):

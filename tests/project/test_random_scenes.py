@@ -114,6 +114,22 @@ def test_materials_outside_the_families_are_drawn_on_request(loaded):
     assert not {*random.families} & {*random.outside}
 
 
+def test_solids_with_a_viscous_part_are_drawn(raw):
+    """They are stable, within their ranges, and among the candidates."""
+    study = loading.read_yaml(ROOT / "config/studies/viscous_solids.yaml")
+    settings = loading.load(loading.merged(raw, study), ROOT)
+    assert settings.random.is_development
+    drawn = {settings.random.family(name): settings.scenes[name] for name in settings.random_scenes}
+    for name in ("kelvin_voigt", "maxwell"):
+        scene, law = drawn[name], drawn[name].law.plain()
+        constants, ranges = law["viscosity"], settings.random.families[name].viscosity.ranges
+        assert constants["name"] == name and ranges.keys() == constants.keys() - {"name"}
+        for key, (low, high) in ranges.items():
+            assert low * 0.995 <= constants[key] <= high * 1.005
+        assert MPM(grid=36, dt=scene.dt).courant(analytic_law(law, dt=scene.dt), DENSITY) <= 0.6 * (1 + 1e-3)
+        assert settings.identify.families[name].viscosity.name == name
+
+
 def test_the_calibration_has_every_kind_of_truth(raw):
     """Candidates and others on the same grid and converged, all with an unknown friction."""
     study = loading.read_yaml(ROOT / "config/studies/calibration.yaml")

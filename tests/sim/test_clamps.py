@@ -16,7 +16,7 @@ from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.settle import settle
 from neuma_lib.sim.state import State
 from tests.support.errors import refused
-from tests.support.sim_scenes import DENSITY, DT, cube, make_law, moving_cube, prism, strained
+from tests.support.sim_scenes import DENSITY, DT, cube, loss_of, make_law, moving_cube, prism, strained
 
 pytestmark = pytest.mark.core
 
@@ -40,14 +40,6 @@ def clamped_cube(name, count=60, **options):
     x, mass, vol0 = cube(count)
     v, F, C = strained(x, size=0.02)
     return model, State(x, v, mass, vol0, F, C)
-
-
-def loss_of(path):
-    generator = torch.Generator().manual_seed(0)
-    return sum(
-        (torch.randn(value.shape, generator=generator, dtype=value.dtype).to(value.device) * value).sum()
-        for value in (10 * path.x, path.v, path.F, 0.1 * path.C)
-    )
 
 
 @pytest.mark.parametrize("name", CLAMPS)

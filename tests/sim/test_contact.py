@@ -13,9 +13,16 @@ from neuma_lib.sim.free_flight import free_flight_steps
 from neuma_lib.sim.model import MPM, as_regions, contact_clearance
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
-from tests.support.contact_scenes import COLLIDERS, MOTION, SHAPES, falling_on, lattice
+from tests.support.contact_scenes import (
+    COLLIDERS,
+    MOTION,
+    SHAPES,
+    assert_equals_twin,
+    assert_gradient_is_the_difference,
+    falling_on,
+    lattice,
+)
 from tests.support.errors import refused
-from tests.support.gradients import check_small_differences
 from tests.support.sim_scenes import DENSITY, DT, angular_momentum, linear_momentum, make_law, moving_cube
 
 pytestmark = pytest.mark.core
@@ -23,46 +30,14 @@ pytestmark = pytest.mark.core
 GRAVITY = 9.8
 
 
-def loss_of(path):
-    generator = torch.Generator().manual_seed(0)
-    return sum(
-        (torch.randn(value.shape, generator=generator, dtype=value.dtype) * value).sum()
-        for value in (10 * path.x, path.v, path.F)
-    )
-
-
 @pytest.mark.parametrize("name", COLLIDERS)
 def test_equals_the_torch_twin(name):
-    """States and gradients of 40 steps of contact."""
-    model, start = falling_on(COLLIDERS[name])
-    law = make_law("neo_hookean")
-    results = []
-    for slow in (False, True):
-        own = replace(start, x=start.x.clone().requires_grad_(), v=start.v.clone().requires_grad_())
-        if slow:
-            x, v, F, _ = torch_simulation.rollout(model, as_regions(law, 60), own, (20, 40))
-            path = replace(results[0][2], x=x, v=v, F=F)
-        else:
-            path = rollout(model, law, own, steps=40, frames=(20, 40))
-        grads = torch.autograd.grad(loss_of(path), (own.x, own.v))
-        results.append((path.x.detach(), grads, path))
-    (fast, fast_grads, _), (slow, slow_grads, _) = results
-    assert contact_clearance(model, fast, start.vol0, (20, 40)).min() < 0
-    torch.testing.assert_close(fast, slow, rtol=0, atol=1e-12)
-    for a, b in zip(fast_grads, slow_grads, strict=True):
-        assert (a - b).abs().max() < 1e-9 * b.abs().max()
+    assert_equals_twin(*falling_on(COLLIDERS[name], SHAPES["plane"]))
 
 
 @pytest.mark.parametrize("name", COLLIDERS)
 def test_finite_differences(name):
-    """Through first contact, stick and slip, with respect to x0 and v0."""
-    model, start = falling_on(COLLIDERS[name])
-    law = make_law("neo_hookean")
-
-    def value(x, v):
-        return loss_of(rollout(model, law, replace(start, x=x, v=v), steps=60, frames=(30, 60)))
-
-    check_small_differences(value, (start.x, start.v), 1e-5)
+    assert_gradient_is_the_difference(*falling_on(COLLIDERS[name], SHAPES["plane"]))
 
 
 @pytest.mark.parametrize("name", SHAPES)
@@ -164,7 +139,7 @@ def test_momenta_change_by_the_impulse_on_the_collider(friction):
     The transfer conserves both, except for the moment of the stress of the affine velocities, which is symmetric here.
     The torch twin has the displacements that friction depends on.
     """
-    model, start = falling_on(replace(COLLIDERS["moving"], friction=friction))
+    model, start = falling_on(replace(COLLIDERS["moving"], friction=friction), SHAPES["plane"])
     model = replace(model, colliders=model.colliders[:1])
     law = make_law("fixed_corotated")
     path = rollout(model, law, start, steps=41, frames=(40, 41))

@@ -13,24 +13,14 @@ from neuma_lib.sim.colliders import Collider
 from neuma_lib.sim.model import MPM, MaterialRegion, contact_clearance
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
-from tests.support.contact_scenes import COLLIDERS, falling_on, lattice
+from tests.support.contact_scenes import COLLIDERS, SHAPES, falling_on, lattice
 from tests.support.gradients import check_small_differences
-from tests.support.sim_scenes import DT, make_law
+from tests.support.sim_scenes import DT, loss_of, make_law
 
 pytestmark = pytest.mark.core
 
 FRAMES = (15, 40)
 RUN = dict(steps=FRAMES[-1], frames=FRAMES)
-
-
-def loss_of(path):
-    generator = torch.Generator().manual_seed(0)
-    values = [10 * path.x, path.v, path.F, 0.1 * path.C, path.F_total]
-    return sum(
-        (torch.randn(value.shape, generator=generator, dtype=torch.float64) * value).sum()
-        for value in values
-        if value is not None
-    )
 
 
 def gradients(model, law, start, **options):
@@ -75,7 +65,7 @@ def test_segments_do_not_change_the_gradient(cache_bytes):
 @pytest.mark.parametrize("name", ["box", "sticking"])
 def test_a_rollout_in_two_parts_is_the_whole(name):
     """States and gradients, also if the second part starts inside contact, in stick and in slip."""
-    model, start = falling_on(COLLIDERS[name])
+    model, start = falling_on(COLLIDERS[name], SHAPES["plane"])
     law = make_law("von_mises")
     whole, expected = gradients(model, law, start, total=False)
     own = replace(start, x=start.x.clone().requires_grad_(), v=start.v.clone().requires_grad_())
@@ -93,7 +83,7 @@ def test_a_rollout_in_two_parts_is_the_whole(name):
 @pytest.mark.parametrize("name", ["moving", "sticking"])
 def test_copies_equal_single_rollouts(name):
     """Each has its law and its start; free flight ends for all copies with the first contact of any."""
-    model, start = falling_on(COLLIDERS[name])
+    model, start = falling_on(COLLIDERS[name], SHAPES["plane"])
     lifted = replace(start, x=start.x + 0.01 * torch.tensor([0.0, 1.0, 0.0]).double())
     slow = State(start.x, 0.5 * start.v, start.mass, start.vol0)
     names, starts = ("neo_hookean", "fluid", "neural"), (start, lifted, slow)
@@ -108,7 +98,7 @@ def test_copies_equal_single_rollouts(name):
 
 def test_several_bodies_equal_the_torch_twin():
     """Bodies of two laws, with the total deformation: states and gradients."""
-    model, start = falling_on(COLLIDERS["moving"])
+    model, start = falling_on(COLLIDERS["moving"], SHAPES["plane"])
     bodies = [MaterialRegion(make_law("von_mises"), 0, 25), MaterialRegion(make_law("hencky"), 25, 60)]
     path, grads = gradients(model, bodies, start, total=True)
     assert touches(model, path, start)
@@ -124,7 +114,7 @@ def test_several_bodies_equal_the_torch_twin():
 @pytest.mark.parametrize("name", COLLIDERS)
 def test_float32_agrees_with_float64(name):
     """To the round-off of a float32, which 40 steps with contact enlarge."""
-    model, start = falling_on(COLLIDERS[name])
+    model, start = falling_on(COLLIDERS[name], SHAPES["plane"])
     law = make_law("neo_hookean")
     single = State(*(getattr(start, part).float() for part in ("x", "v", "mass", "vol0", "F", "C")))
     (path, grads), (exact, exact_grads) = (gradients(model, law, own) for own in (single, start))

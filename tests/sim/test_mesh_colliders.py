@@ -8,7 +8,6 @@ import pytest
 import torch
 import trimesh
 
-from benchmarks import torch_simulation
 from neuma_lib.geometry.mesh_collider import MARGIN, mesh_collider
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.sim.colliders import Collider, DistanceGrid, contact_radius
@@ -16,9 +15,9 @@ from neuma_lib.sim.free_flight import free_flight_steps
 from neuma_lib.sim.model import MPM, as_regions, contact_clearance
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
+from tests.support.contact_scenes import assert_equals_twin, assert_gradient_is_the_difference, falling_on
 from tests.support.errors import refused
-from tests.support.gradients import check_small_differences
-from tests.support.sim_scenes import DT, cube, make_law, moving_cube
+from tests.support.sim_scenes import DT, loss_of, make_law, moving_cube
 
 RADIUS = 0.15
 
@@ -46,24 +45,6 @@ COLLIDERS = {
     "narrow grid": [narrow_grid(friction=0.3, damping=0.2, **POSE)],
     "two": [ball(friction=0.3, **POSE), ball(2, 17, friction=math.inf, centre=(0.65, 0.25, 0.5))],
 }
-
-
-def falling_on(colliders):
-    """A model, and a spinning cube 1 cm above its colliders."""
-    model = MPM(14, DT, contact="particles", colliders=tuple(colliders))
-    x, mass, vol0 = cube(60, side=0.2, centre=(0.45, 0.7, 0.5))
-    while (clearance := float(contact_clearance(model, x, vol0))) > 0.0101:
-        x = x - (clearance - 0.01) * torch.tensor([0.0, 1.0, 0.0]).double()
-    velocity, spin = torch.tensor([[1.0, -1.5, 0.3], [3.0, -2.0, 4.0]]).double()
-    return model, State.rigid(x, mass, vol0, velocity, spin)
-
-
-def loss_of(path):
-    generator = torch.Generator().manual_seed(0)
-    return sum(
-        (torch.randn(value.shape, generator=generator, dtype=value.dtype).to(value.device) * value).sum()
-        for value in (10 * path.x, path.v, path.F)
-    )
 
 
 def test_the_distance_of_a_sphere():
@@ -117,24 +98,9 @@ def test_the_distance_of_a_box():
 
 @pytest.mark.parametrize("name", COLLIDERS)
 def test_equals_the_torch_twin(name):
-    """States and gradients of 40 steps of contact, in both precisions."""
-    model, start = falling_on(COLLIDERS[name])
-    law = make_law("neo_hookean")
-    results = []
-    for slow in (False, True):
-        own = replace(start, x=start.x.clone().requires_grad_(), v=start.v.clone().requires_grad_())
-        if slow:
-            x, v, F, _ = torch_simulation.rollout(model, as_regions(law, 60), own, (20, 40))
-            path = replace(results[0][2], x=x, v=v, F=F)
-        else:
-            path = rollout(model, law, own, steps=40, frames=(20, 40))
-        grads = torch.autograd.grad(loss_of(path), (own.x, own.v))
-        results.append((path.x.detach(), grads, path))
-    (fast, fast_grads, _), (slow, slow_grads, _) = results
-    assert contact_clearance(model, fast, start.vol0, (20, 40)).min() < 0
-    torch.testing.assert_close(fast, slow, rtol=0, atol=1e-12)
-    for a, b in zip(fast_grads, slow_grads, strict=True):
-        assert (a - b).abs().max() < 1e-9 * b.abs().max()
+    """In both precisions."""
+    model, start = falling_on(*COLLIDERS[name])
+    slow = assert_equals_twin(model, start)
     single = State(
         *(value.float() for value in (start.x, start.v, start.mass, start.vol0)), C=start.C.float()
     )
@@ -146,7 +112,7 @@ def test_equals_the_torch_twin(name):
 @pytest.mark.parametrize("name", COLLIDERS)
 def test_cuda_equals_cpu(name):
     """States and gradients, direct and as a replayed graph."""
-    model, start = falling_on(COLLIDERS[name])
+    model, start = falling_on(*COLLIDERS[name])
     law = make_law("neo_hookean")
     results = []
     for device in ("cpu", "cuda", "cuda", "cuda"):
@@ -162,14 +128,7 @@ def test_cuda_equals_cpu(name):
 
 @pytest.mark.parametrize("name", COLLIDERS)
 def test_finite_differences(name):
-    """Through first contact, stick and slip, with respect to x0 and v0."""
-    model, start = falling_on(COLLIDERS[name])
-    law = make_law("neo_hookean")
-
-    def value(x, v):
-        return loss_of(rollout(model, law, replace(start, x=x, v=v), steps=60, frames=(30, 60)))
-
-    check_small_differences(value, (start.x, start.v), 1e-5)
+    assert_gradient_is_the_difference(*falling_on(*COLLIDERS[name]))
 
 
 def test_free_flight_ends_where_the_body_touches():

@@ -13,6 +13,7 @@ import torch
 
 from neuma_lib.errors import NonFiniteError
 from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.mechanics.neural import neural_law
 from neuma_lib.mechanics.structured import structured_law
 from neuma_lib.sim import segment_loop, workspace
 from neuma_lib.sim.batch import rollout_batch
@@ -177,13 +178,15 @@ def test_segments_equal_steps_of_python(contact, name, monkeypatch):
     assert_near(steps[1], expected[0][1], 1e-11)
 
 
-@pytest.mark.parametrize("plastic", [None, "von_mises"])
-def test_segments_of_structured_laws_equal_steps_of_python(plastic, monkeypatch):
+@pytest.mark.parametrize("learned", ["elasticity", "with return map", "networks"])
+def test_segments_of_learned_laws_equal_steps_of_python(learned, monkeypatch):
     """The same bytes of states and gradients, also of the weights, next to an analytic body and for any segments.
 
-    Steps of Python compute stresses from F alone, so that they differ in rounding.
+    Steps of Python compute stresses of structured laws from F alone, so that they differ in rounding.
     """
-    law = structured_law(specification(plastic=plastic), dt=DT).double()
+    plastic = "von_mises" if learned == "with return map" else None
+    law = structured_law(specification(plastic=plastic), dt=DT) if learned != "networks" else neural_law()
+    law = law.double()
     law.attach_adaptor(rank=None)
     generator = torch.Generator().manual_seed(4)
     parameters = list(law.parameters())
@@ -199,7 +202,7 @@ def test_segments_of_structured_laws_equal_steps_of_python(plastic, monkeypatch)
 
     options = [{}, {"cache_bytes": 0}, {"memory": 1.2e6}, {"memory": 1.2e6, "cache_bytes": 0}]
     expected = grads()
-    assert len(expected) == 2 + (3 if plastic is None else 6) and all(each.any() for each in expected)
+    assert len(expected) == 2 + (3 if learned == "elasticity" else 6) and all(each.any() for each in expected)
     for own in options:
         assert_equal(grads(**own), expected)
     monkeypatch.setattr(segment_loop, "PARTICLE_STEPS", 3 * len(start.x))
@@ -299,6 +302,5 @@ def test_other_processors(flags, tmp_path):
 
 
 def test_laws_of_the_loop():
-    """Analytic laws run in it, networks do not."""
-    assert all(make_law(name).elasticity.native_rows for name in SPECS)
-    assert not make_law("neural").elasticity.native_rows
+    """Analytic laws and networks."""
+    assert all(make_law(name).elasticity.loops for name in (*SPECS, "neural"))

@@ -18,7 +18,7 @@ from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.settle import settle
 from neuma_lib.sim.state import State
 from tests.support.errors import refused
-from tests.support.sim_scenes import DENSITY, DT, cube, prism, strained
+from tests.support.sim_scenes import DENSITY, DT, cube, loss_of, prism, strained
 
 pytestmark = pytest.mark.core
 
@@ -45,12 +45,6 @@ def scene(**options):
     generator = torch.Generator().manual_seed(5)
     turned = F + 0.02 * torch.randn(F.shape, generator=generator, dtype=F.dtype)
     return model, State(x, v, mass, vol0, F, C, F_branch=turned)
-
-
-def loss_of(path):
-    generator = torch.Generator().manual_seed(0)
-    values = 10 * path.x, path.v, path.F, 0.1 * path.C
-    return sum((torch.randn(v.shape, generator=generator, dtype=v.dtype) * v).sum() for v in values)
 
 
 def constants_of(name):

@@ -60,7 +60,6 @@ def test_squared_error_of_bytes_is_that_of_their_colours_over_white(shape, dtype
     grads = [torch.autograd.grad(value, images, weight)[0] for value in values]
     assert_near(*(value.detach() for value in values), dtype)
     assert_near(*grads, dtype)
-    assert torch.equal(mean_squared_error(images, observed), values[0]), "sums have a fixed order"
 
 
 def test_a_large_image_keeps_its_precision_in_float32():

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from neuma_lib.splatting import torch_reference
+from benchmarks import torch_rasterizer
 from neuma_lib.splatting.rasterizer import RenderBuffers, Statistics, rasterize
 from tests.support.errors import refused
 from tests.support.render_scenes import (
@@ -28,7 +28,7 @@ def render_with_gradients(render, scene, **options):
 
 
 def assert_equals_twin(scene, **options):
-    expected, expected_grads = render_with_gradients(torch_reference.rasterize, scene, **options)
+    expected, expected_grads = render_with_gradients(torch_rasterizer.rasterize, scene, **options)
     actual, grads = render_with_gradients(rasterize, scene, **options)
     for a, b in zip(expected, actual, strict=True):
         assert (a - b).abs().max() < 1e-9

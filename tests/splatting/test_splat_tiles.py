@@ -6,8 +6,8 @@ On a GPU the kernels themselves run; everywhere the same CUDA code runs compiled
 import pytest
 import torch
 
-from benchmarks import gsplat_backend
-from neuma_lib.splatting import compositor_cuda, projection, rasterizer, torch_reference
+from benchmarks import gsplat_backend, torch_rasterizer
+from neuma_lib.splatting import compositor_cuda, projection, rasterizer
 from neuma_lib.splatting.compositing import Settings
 from neuma_lib.splatting.image_loss import mean_squared_error
 from neuma_lib.splatting.rasterizer import RenderBuffers, Statistics, rasterize, rasterized_error
@@ -86,7 +86,7 @@ def needles(scene):
 def test_equals_the_twin(render, name):
     make, width, height, options = SCENES[name]
     scene = make()
-    expected, expected_grads = with_gradients(torch_reference.rasterize, scene, width, height, **options)
+    expected, expected_grads = with_gradients(torch_rasterizer.rasterize, scene, width, height, **options)
     actual, grads = with_gradients(render, scene, width, height, **options)
     check_images(*actual, *expected)
     for a, b in zip(expected_grads, grads, strict=True):

@@ -1,14 +1,18 @@
 """Furniture, marks by hand, and troubles of cameras in the captures of rooms.yaml."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from neuma_lib.config.validation import validate
+from neuma_lib.io.files import read_json
 from neuma_lib.project.loading import read_yaml
+from studies.capture_benchmark import rooms
 from studies.capture_benchmark.filming import hand_path, shaken, together
 from studies.capture_benchmark.furniture import FREE, RULER, furniture, marks, rolling_ball
 from studies.capture_benchmark.planned import capture_settings, photograph_files
-from studies.capture_benchmark.rooms import refusal, table
+from studies.capture_benchmark.rooms import main, refusal, table
 from studies.capture_benchmark.settings import DemoCapturesConfig
 from studies.capture_benchmark.stage import MIDDLE, lying, photographers, solid
 
@@ -121,3 +125,31 @@ def test_a_refusal_is_the_message_of_the_stage_that_stopped():
     output = "[04:00] something\nERROR: mug, one, left: the camera moves (more in rooms/results/logs/a.log)\nmore\n"
     assert refusal(output) == "mug, one, left: the camera moves"
     assert refusal("a traceback").endswith("traceback")
+
+
+def test_stages_can_be_run_one_after_the_other(monkeypatch, tmp_path):
+    """Core seconds of the same capture add up, and files that exist are not rendered again."""
+    monkeypatch.setattr(rooms, "SETTINGS", Path("studies/capture_benchmark/rooms.yaml").resolve())
+    monkeypatch.chdir(tmp_path)
+    capture, results = Path("rooms/captures/demo_duck_handheld"), Path("rooms/results")
+    for file in ("capture.yaml", "videos/first/left.mp4", "videos/first/right.mp4"):
+        (capture / file).parent.mkdir(parents=True, exist_ok=True)
+        (capture / file).touch()
+    asked = []
+
+    def workflow(arguments):
+        asked.append(arguments)
+        last = Path(arguments[-1])
+        if last.name == "report.html":
+            return 2.0, "ERROR: the camera moves (more in a.log)"
+        last.parent.mkdir(parents=True)
+        last.touch()
+        return 30.0, ""
+
+    monkeypatch.setattr(rooms, "snakemake", workflow)
+    for arguments, end in ((["--to", "motion.md"], "motion"), ([], "the camera moves")):
+        monkeypatch.setattr("sys.argv", ["rooms", *arguments, "duck_handheld"])
+        main()
+        assert read_json(results / "rooms.json")["duck_handheld"]["end"] == end
+    assert read_json(results / "rooms.json")["duck_handheld"]["core_seconds"] == 32
+    assert len(asked) == 2 and not any("--snakefile" in arguments for arguments in asked)

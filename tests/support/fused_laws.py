@@ -2,6 +2,20 @@
 
 import torch
 
+from neuma_lib.mechanics.law import Constitutive
+
+
+def twin(part, F, weights, g):
+    """Result, gradient of F and of the weights by torch."""
+    grad_F, grads = Constitutive.vjp(part, F, weights, g)
+    return [Constitutive.evaluate(part, F, weights), grad_F, *grads]
+
+
+def fast(part, F, weights, g):
+    """The same by the kernels."""
+    grad_F, grads = part.vjp(F, weights, g)
+    return [part.evaluate(F, weights), grad_F, *grads]
+
 
 def distance(a: torch.Tensor, b: torch.Tensor) -> float:
     """Relative distance of a from b, by norm."""

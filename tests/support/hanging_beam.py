@@ -56,12 +56,12 @@ def resting_beam(size, clamp=CLAMP, nu=0.49, held=None):
     return RestingBody(mesh, law, 100.0, [clamped], np.eye(3), hidden, 0.005, held)
 
 
-def observe(mask, seed=1):
-    """A still of a mask, with corners of the marker that have an error of 0.5 px."""
+def observe(mask, seed=1, noise=0.5):
+    """A still of a mask, with corners of the marker that have an error [px]."""
     local = MARKER @ POSE[:3, :3].T + POSE[:3, 3]
     pixels = local @ K.T
-    noise = np.random.default_rng(seed).normal(0, 0.5, (4, 2))
-    return Still(mask, K, MARKER, pixels[:, :2] / pixels[:, 2:] + noise)
+    error = np.random.default_rng(seed).normal(0, noise, (4, 2))
+    return Still(mask, K, MARKER, pixels[:, :2] / pixels[:, 2:] + error)
 
 
 def image_of(beam, *shape, still=None, centre=None):
@@ -89,12 +89,13 @@ def depth_camera(mask):
     return Still(mask & ~unknown, K2, np.empty((0, 3)), np.empty((0, 2)), camera, unknown)
 
 
-def filmed(beam, ratio, folder):
-    """Mask (HEIGHT, WIDTH) of the beam at rest with mu / rho, rendered by Blender, with its root behind a box."""
-    x = beam.weights @ beam.at_rest(ratio).x + PLACEMENT
+def filmed(beam, shape, folder, still=None):
+    """Mask (HEIGHT, WIDTH) of the beam rendered by Blender, with its root behind a box. Arguments as of `image_of`."""
+    x = beam.positions(np.array([*shape, 0.0, 0.0, 0.0][:4])) + PLACEMENT
     x[:, 1] += 1.0  # above Blender's floor
-    high = POSE @ np.block([[np.eye(3), np.array([[0.0], [-1.0], [0.0]])], [np.zeros(3), 1.0]])
-    views = Views(np.linalg.inv(high)[None] @ np.diag([1.0, -1.0, -1.0, 1.0]), K[0, 0], WIDTH, HEIGHT)
+    pose, focal = (POSE, K[0, 0]) if still is None else (still.camera @ POSE, still.K[0, 0])
+    high = pose @ np.block([[np.eye(3), np.array([[0.0], [-1.0], [0.0]])], [np.zeros(3), 1.0]])
+    views = Views(np.linalg.inv(high)[None] @ np.diag([1.0, -1.0, -1.0, 1.0]), focal, WIDTH, HEIGHT)
     box = trimesh.creation.box((0.05, 0.08, 0.05)).apply_translation(PLACEMENT + [0.085, 1.0, 0.0])
     hides = Obstacle(np.asarray(box.vertices), np.asarray(box.faces), np.eye(4)[None], (0.9, 0.9, 0.9))
     surface = Surface(x[None], beam.triangles, np.full_like(x, 0.5))

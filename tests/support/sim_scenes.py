@@ -131,3 +131,14 @@ def angular_momentum(model, mass, x, v, C):
     """Sum of x cross m v and of APIC's part m (dx^2 / 4) axial(C) [kg m^2/s], shape (3,)."""
     orbit = torch.linalg.cross(x, v)
     return (mass[:, None] * (orbit + model.dx**2 / 4 * axial(C))).sum(dim=0)
+
+
+def loss_of(path):
+    """A random linear function of the states of a path, the same in all precisions."""
+    generator = torch.Generator().manual_seed(0)
+    values = [10 * path.x, path.v, path.F, 0.1 * path.C, path.F_total]
+    return sum(
+        (torch.randn(value.shape, generator=generator, dtype=torch.float64).to(value.device) * value).sum()
+        for value in values
+        if value is not None
+    )

@@ -8,8 +8,6 @@ from pathlib import Path
 import pytest
 import yaml
 
-from neuma_lib.data.blender.libraries import explain_import_error
-
 ROOT = Path(__file__).resolve().parents[2]
 ENVS = ROOT / "envs"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -63,8 +61,3 @@ def test_a_missing_python_is_named(tmp_path):
     assert done.returncode != 0
     assert "Python 3.11 is needed" in done.stderr and "apt-get install python3.11" in done.stderr
     assert not (tmp_path / "venv").exists()
-
-
-def test_a_missing_system_library_is_named_with_its_package():
-    text = "ImportError: libXi.so.6: cannot open shared object file: No such file or directory"
-    assert "apt-get install libxi6" in explain_import_error(text).remedy

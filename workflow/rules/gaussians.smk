@@ -10,6 +10,7 @@ rule gaussians:
         report=f"{RESULTS}/{{scene}}/gaussians.json",
     wildcard_constraints:
         scene=PICTURED_SCENE,
+    priority: 1
     resources:
         gpu=GPU,
     params:

@@ -17,6 +17,7 @@ for views in ("", "+views={views}"):
             identified=f"{RESULTS}/{{scene}}/identified{views}.json",
         wildcard_constraints:
             scene=SINGLE_SCENE,
+        priority: 1
         threads: identify_threads
         resources:
             gpu=GPU,

@@ -66,10 +66,10 @@ EITHER_GPU = int(GPU and HAS_CUDA)
 # Scripts run in separate processes. They find the library, share one kernel cache, and use one thread each (two OpenMP
 # threads on a busy machine are far slower than one). NEUMA_GPUS is the number of GPUs to spread them over.
 THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
-SPREAD = [str(ROOT / "workflow" / "gpus")] if os.environ.get("NEUMA_GPUS") else []
+FOLDERS = [str(ROOT / "workflow" / "interpreter"), str(ROOT)]
 os.environ.update(
     {
-        "PYTHONPATH": os.pathsep.join([*SPREAD, str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]),
+        "PYTHONPATH": os.pathsep.join([*FOLDERS, *filter(None, [os.environ.get("PYTHONPATH")])]),
         "NEUMA_KERNEL_CACHE": str(Path(SETTINGS.kernel_cache).resolve()),
         **{name: os.environ.get(name, "1") for name in THREAD_LIMITS},
     }

@@ -6,6 +6,7 @@ from pathlib import Path
 from neuma_lib.config.specimens import SpecimenConfig
 from neuma_lib.evaluation.plotting.specimens import specimen_figure
 from neuma_lib.evaluation.plotting.style import save
+from neuma_lib.fitting.families import Family
 from neuma_lib.fitting.specimen_fit import fit_specimen, numerical_damping, specimen_problem
 from neuma_lib.io.files import write_json
 from neuma_lib.io.markers import read_markers
@@ -22,6 +23,7 @@ def main(inputs, output, params, run) -> None:
         run.log(f"{cells} cells along the height")
         fit = fit_specimen(*problem, cells=cells, **options)
         spec = fit.family.law_spec(fit.values)
+        problem = problem[0], Family("specimen", spec), *problem[2:]  # the next grid starts there
         numerical = numerical_damping(problem[0], spec, cells, settings.duration)
         fits.append({"cells": cells, **fit.as_dict(), "without_viscosity": asdict(numerical)})
         run.log(f"the simulation itself has a damping ratio of {numerical.damping:.4f}")

@@ -4,7 +4,7 @@ from neuma_lib.capture.calibration.marker import marker_poses
 from neuma_lib.config.stills import RestingBodyConfig, SwingConfig
 from neuma_lib.evaluation.plotting.specimens import swing_figure
 from neuma_lib.evaluation.plotting.style import save
-from neuma_lib.fitting.swing import swing_record
+from neuma_lib.fitting.swing import FITS, swing_record
 from neuma_lib.io.datasets.stills import read_stills, read_swing
 from neuma_lib.io.files import read_json, write_json
 from neuma_lib.io.mesh_files import read_any_mesh
@@ -22,11 +22,10 @@ def main(inputs, output, params, run) -> None:
     write_json(output.result, result)
     for name, clamp in result["clamps"].items():
         for own in clamp["grids"]:
-            predicted, fitted = own["predicted"], own["fitted"]
-            run.log(
-                f"{name}, cells of {1e3 * own['cell']:g} mm: contour {predicted['contour_rms']:.2f} px predicted, "
-                f"{fitted['contour_rms']:.2f} px fitted with {fitted['ratio'] / clamp['hang']:.3f} times the stiffness"
-            )
+            for key in FITS:
+                contour, stiffness = own[key]["contour_rms"], own[key]["ratio"] / clamp["hang"]
+                where = f"{name}, cells of {1e3 * own['cell']:g} mm, {key}"
+                run.log(f"{where}: contour {contour:.2f} px, {stiffness:.3f} times the stiffness of the hang")
     save(swing_figure(result), output.figure)
 
 

@@ -25,27 +25,41 @@ def median_background(frames: Sequence[np.ndarray]) -> np.ndarray:
 def match_exposure(frame: np.ndarray, background: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Gain and offset of each channel, (3,) each, such that frame = gain * background + offset where nothing moved.
 
-    Trimmed least squares, valid if moving objects cover less than half of the picture.
+    Trimmed least squares, valid if moving objects cover less than half of the picture. Pixels with equal levels in both
+    pictures are one value, weighted with their number.
     """
     gains, offsets = np.ones(3), np.zeros(3)
     step = max(1, int(np.sqrt(frame[..., 0].size / 5e4)))  # two unknowns do not need every pixel
     for c in range(3):
-        seen, empty = (p[::step, ::step, c].ravel().astype(np.float64) for p in (frame, background))
-        valid = (seen > 4) & (seen < 251) & (empty > 4) & (empty < 251)  # not clipped
-        if valid.sum() < 100:
+        seen, empty = (p[::step, ::step, c].ravel().astype(np.int64) for p in (frame, background))
+        counts = np.bincount(256 * empty + seen, minlength=256 * 256).reshape(256, 256)
+        counts[[*range(5), *range(251, 256)]] = counts[:, [*range(5), *range(251, 256)]] = 0  # clipped
+        empty, seen = np.nonzero(counts)
+        weights = counts[empty, seen]
+        if weights.sum() < 100:
             continue
-        seen, empty = seen[valid], empty[valid]
-        ratio = np.median(seen / empty)
-        kept = np.abs(seen - ratio * empty) <= np.quantile(np.abs(seen - ratio * empty), 0.6)
+        residual = np.abs(seen - weighted_quantile(seen / empty, weights, 0.5) * empty)
+        kept = residual <= weighted_quantile(residual, weights, 0.6)
         for _ in range(8):
-            x, y = empty[kept], seen[kept]
+            share = weights * kept / weights[kept].sum()
+            x, y = share @ empty, share @ seen
+            variance = share @ (empty - x) ** 2
             # In a background of one brightness, offset and gain are indistinguishable.
-            gain = np.cov(x, y)[0, 1] / x.var(ddof=1) if x.std() > 4 else y.mean() / x.mean()
-            offset = y.mean() - gain * x.mean()
+            gain = share @ ((empty - x) * (seen - y)) / variance if variance > 4**2 else y / x
+            offset = y - gain * x
             residual = np.abs(seen - gain * empty - offset)
-            kept = residual <= max(2.0, 3 * 1.4826 * np.median(residual))
+            kept = residual <= max(2.0, 3 * 1.4826 * weighted_quantile(residual, weights, 0.5))
         gains[c], offsets[c] = gain, offset
     return gains, offsets
+
+
+def weighted_quantile(values: np.ndarray, counts: np.ndarray, share: float) -> float:
+    """`np.quantile` of values (N,) that occur several times each, (N,)."""
+    order = np.argsort(values)
+    below = np.cumsum(counts[order])
+    rank = share * (below[-1] - 1)
+    low, high = values[order[np.searchsorted(below, [np.floor(rank), np.ceil(rank)], side="right")]]
+    return float(low + (rank % 1) * (high - low))
 
 
 def exposed(background: np.ndarray, gain: np.ndarray, offset: np.ndarray) -> np.ndarray:

@@ -8,39 +8,19 @@ import sys
 
 from neuma_lib.errors import InputError
 
-DEBIAN_PACKAGES = {
-    "libX11.so": "libx11-6",
-    "libXext.so": "libxext6",
-    "libXrender.so": "libxrender1",
-    "libXxf86vm.so": "libxxf86vm1",
-    "libXfixes.so": "libxfixes3",
-    "libXi.so": "libxi6",
-    "libxkbcommon.so": "libxkbcommon0",
-    "libSM.so": "libsm6",
-    "libICE.so": "libice6",
-    "libGL.so": "libgl1",
-    "libEGL.so": "libegl1",
-    "libGLU.so": "libglu1-mesa",
-    "libgomp.so": "libgomp1",
-    "libwayland-client.so": "libwayland-client0",
-}
-"""Shared library that bpy needs even without a display -> Debian/Ubuntu package."""
-
-EVERYTHING = "libx11-6 libxext6 libxrender1 libxfixes3 libxi6 libxkbcommon0 libsm6 libice6 libgl1"
+DEBIAN_PACKAGES = (
+    "libx11-6 libxext6 libxrender1 libxxf86vm1 libxfixes3 libxi6 libxkbcommon0 libsm6 libice6 libgl1 libegl1 "
+    "libglu1-mesa libgomp1 libwayland-client0"
+)
+"""Debian and Ubuntu packages with the shared libraries that bpy needs even without a display."""
 
 
 def explain_import_error(text: str) -> InputError | None:
-    """The error that explains an import error of Blender in ``text``, with the package to install; None without one."""
+    """The error that explains an import error of Blender in ``text``, with packages to install; None without one."""
     missing = re.search(r"ImportError: (\S+): cannot open shared object file", text)
     if missing:
-        library = missing.group(1)
-        problem = f"needs the system library {library}"
-        package = next((p for stem, p in DEBIAN_PACKAGES.items() if library.startswith(stem)), None)
-        if package is None:
-            remedy = f"Install the package that contains it (on Debian: apt-file search {library})."
-            return InputError("Blender (bpy)", problem, remedy)
-        remedy = f"Run `apt-get install {package}`, or, for all libraries of Blender, `apt-get install {EVERYTHING}`"
-        return InputError("Blender (bpy)", problem, remedy)
+        remedy = f"Run `apt-get install {DEBIAN_PACKAGES}`, or install the package that contains it"
+        return InputError("Blender (bpy)", f"needs the system library {missing.group(1)}", remedy)
     if re.search(r"ModuleNotFoundError: No module named 'bpy'", text):
         return InputError(
             "Blender (bpy)",

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
-import warp as wp
 from torch import Tensor
-from torch.autograd.function import once_differentiable
+from torch.nn.functional import embedding_bag
 
-from neuma_lib.device import launch
 from neuma_lib.errors import InputError
-from neuma_lib.methods.pac_nerf.lattice_kernels import kernels, lattice_types
 
 EMPTY = -100.0
 """Value of all channels at a node without particles, which as raw density has no opacity (PAC-NeRF)."""
@@ -68,14 +66,6 @@ class Lattice:
         first, last = torch.minimum(one, other).amax(1), torch.maximum(one, other).amin(1)
         return last > first.clamp(min=0)
 
-    def place(self, dtype: torch.dtype):
-        """The lattice as a struct for kernels."""
-        t = lattice_types(dtype)
-        place = t.Place()
-        place.origin, place.inv_voxel = t.vec3(*self.origin), 1.0 / self.voxel
-        place.nodes = wp.vec3i(*self.nodes)
-        return place
-
 
 def interpolate(lattice: Lattice, values: Tensor, points: Tensor) -> Tensor:
     """Interpolated values (M, C), differentiable with respect to those of the nodes, not to the points.
@@ -89,7 +79,8 @@ def interpolate(lattice: Lattice, values: Tensor, points: Tensor) -> Tensor:
         InputError: shapes, dtypes or devices do not match.
     """
     _check(lattice, values, points)
-    return _Interpolate.apply(lattice, values.contiguous(), points.detach().contiguous())
+    nodes, weights = _corners(lattice, points.detach())
+    return embedding_bag(nodes, values.flatten(0, 2), per_sample_weights=weights, mode="sum")
 
 
 def from_particles(lattice: Lattice, x: Tensor, features: Tensor) -> Tensor:
@@ -108,7 +99,34 @@ def from_particles(lattice: Lattice, x: Tensor, features: Tensor) -> Tensor:
     """
     if features.shape[:1] != x.shape[:1] or features.dtype != x.dtype or features.device != x.device:
         raise InputError("features", f"{_kind(features)} do not match positions {_kind(x)}")
-    return _FromParticles.apply(lattice, x.contiguous(), features.contiguous())
+    nodes, weights = _corners(lattice, x)
+    shares = weights[..., None]
+
+    def sums(values: Tensor) -> Tensor:
+        total = values.new_zeros(math.prod(lattice.nodes), values.shape[2])
+        return total.index_add(0, nodes.flatten(), values.flatten(0, 1))
+
+    with torch.no_grad():
+        total = sums(shares)
+        seen = total > MIN_WEIGHT
+        means = torch.where(seen, sums(shares * features[:, None]) / total, EMPTY)
+    # These sums are zero. Their gradient is that of the means, without the cancellation of a quotient of sums.
+    offsets = sums(shares * (features[:, None] - means[nodes])) / torch.where(seen, total, math.inf)
+    return (means + offsets).view(*lattice.nodes, -1)
+
+
+def _corners(lattice: Lattice, x: Tensor) -> tuple[Tensor, Tensor]:
+    """Indices (N, 8) of the nodes around points (N, 3), and their weights, differentiable with respect to x."""
+    place = (x - x.new_tensor(lattice.origin)) / lattice.voxel
+    last = torch.tensor(lattice.nodes, device=x.device) - 2
+    first = torch.minimum(place.detach().floor().long().clamp(min=0), last)
+    far = place - first
+    near_far = torch.stack([1 - far, far])
+    weights = torch.einsum("in,jn,kn->nijk", *near_far.unbind(2)).flatten(1)
+    _, Y, Z = lattice.nodes
+    steps = torch.tensor([Y * Z, Z, 1], device=x.device)
+    corners = torch.cartesian_prod(*[torch.arange(2, device=x.device)] * 3)
+    return (first @ steps)[:, None] + corners @ steps, weights
 
 
 def _kind(value: Tensor) -> str:
@@ -120,56 +138,3 @@ def _check(lattice: Lattice, values: Tensor, points: Tensor) -> None:
     if not shapes_match or values.dtype != points.dtype or values.device != points.device:
         given = f"{_kind(values)} at {lattice.nodes} nodes do not match points {_kind(points)}"
         raise InputError("values", given, "Use shapes (X, Y, Z, C) and (M, 3), one dtype and one device")
-
-
-class _Interpolate(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, lattice, values, points):
-        ctx.lattice, ctx.shape = lattice, values.shape
-        ctx.save_for_backward(points)
-        channels = values.shape[3]
-        out = values.new_empty(len(points), channels)
-        if len(points):
-            kernel, place = kernels(values.dtype, channels).read, lattice.place(values.dtype)
-            launch(kernel, len(points), place, values.view(-1, channels), points, out)
-        return out
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, grad):
-        (points,) = ctx.saved_tensors
-        channels, grad = ctx.shape[3], grad.contiguous()
-        grad_values = grad.new_zeros(ctx.shape)
-        if len(points):
-            place = ctx.lattice.place(grad.dtype)
-            kernel = kernels(grad.dtype, channels).read_adjoint
-            launch(kernel, len(points), place, points, grad, grad_values.view(-1, channels))
-        return None, grad_values, None
-
-
-class _FromParticles(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, lattice, x, features):
-        x, features = x.detach(), features.detach()
-        channels, place = features.shape[1], lattice.place(x.dtype)
-        k = kernels(x.dtype, channels)
-        values = features.new_zeros(*lattice.nodes, channels)
-        weights = features.new_zeros(values[..., 0].numel())
-        flat = values.view(-1, channels)
-        launch(k.deposit, len(x), place, x, features, weights, flat)
-        launch(k.normalise, len(flat), MIN_WEIGHT, EMPTY, weights, flat)
-        ctx.lattice = lattice
-        ctx.save_for_backward(x, features, weights, values)
-        return values
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, grad):
-        x, features, weights, values = ctx.saved_tensors
-        channels = features.shape[1]
-        grad_x, grad_features = torch.empty_like(x), torch.empty_like(features)
-        launch(
-            kernels(x.dtype, channels).deposit_adjoint, len(x), ctx.lattice.place(x.dtype), MIN_WEIGHT, x, features,
-            weights, values.view(-1, channels), grad.contiguous().view(-1, channels), grad_x, grad_features,
-        )  # fmt: skip
-        return None, grad_x, grad_features

@@ -7,29 +7,70 @@ from types import SimpleNamespace
 import torch
 import warp as wp
 
-from neuma_lib.device import start_warp
-from neuma_lib.methods.pac_nerf.lattice_kernels import lattice_functions, lattice_types
+from neuma_lib.device import start_warp, typed
+from neuma_lib.methods.pac_nerf.lattice import Lattice
 
 start_warp()
 
 
 @functools.cache
+def warp_types(dtype: torch.dtype) -> SimpleNamespace:
+    """Warp's types for a torch precision, and the struct of a lattice."""
+    real = wp.dtype_from_torch(dtype)
+    types = SimpleNamespace(real=real, vec3=wp.types.vector(length=3, dtype=real))
+
+    @wp.struct
+    class Place:
+        origin: types.vec3  # position of node (0, 0, 0) [m]
+        inv_voxel: real  # [1/m]
+        nodes: wp.vec3i  # along each axis, the last index is contiguous
+
+    types.Place = Place
+    return types
+
+
+def place_of(lattice: Lattice, dtype: torch.dtype):
+    """A lattice as a struct for kernels."""
+    t = warp_types(dtype)
+    place = t.Place()
+    place.origin, place.inv_voxel = t.vec3(*lattice.origin), 1.0 / lattice.voxel
+    place.nodes = wp.vec3i(*lattice.nodes)
+    return place
+
+
+@functools.cache
 def kernels(dtype: torch.dtype) -> SimpleNamespace:
     """Kernels `march`, `composite` and `composite_adjoint` over rays."""
-    t, functions = lattice_types(dtype), lattice_functions(dtype)
+    t = warp_types(dtype)
     real, vec3, Place = t.real, t.vec3, t.Place
-    cell, within, share, row = functions.cell, functions.within, functions.share, functions.row
     module = wp.get_module(f"{__name__}.{str(dtype).removeprefix('torch.')}")
-    kernel = functools.partial(wp.kernel, enable_backward=False, module=module)
+    types = {
+        "place": Place,
+        **dict.fromkeys(("near", "step", "interval", "shift", "least", "end"), real),
+        "fill": wp.int32,
+        "density": wp.array(dtype=real),
+        "background": vec3,
+        **dict.fromkeys(("starts", "counts"), wp.array(dtype=wp.int32)),
+        "rays": wp.array(dtype=wp.int64),
+        **dict.fromkeys(("alphas", "reaching", "passed", "grad_passed", "grad_alphas"), wp.array(dtype=real)),
+        **dict.fromkeys("origins directions points colours pictures".split(), wp.array(dtype=vec3)),
+        **dict.fromkeys(("grad_pictures", "grad_colours"), wp.array(dtype=vec3)),
+    }
+    kernel = typed(types).kernel(module)
 
     @wp.func(module=module)
     def density_at(place: Place, density: wp.array(dtype=real), x: vec3):
-        c = cell(place, x)
-        f = within(place, x, c)
+        """Trilinear interpolation."""
+        at = (x - place.origin) * place.inv_voxel
+        c = wp.vec3i()
+        for a in range(3):
+            c[a] = wp.clamp(wp.int32(wp.floor(at[a])), 0, place.nodes[a] - 2)
+        f = vec3(at[0] - real(c[0]), at[1] - real(c[1]), at[2] - real(c[2]))
         total = real(0.0)
         for i in range(2):
             for j in range(2):
-                n, w = row(place, c, i, j), share(f[0], i) * share(f[1], j)
+                n = ((c[0] + i) * place.nodes[1] + c[1] + j) * place.nodes[2] + c[2]
+                w = wp.where(i == 1, f[0], real(1.0) - f[0]) * wp.where(j == 1, f[1], real(1.0) - f[1])
                 total += w * ((real(1.0) - f[2]) * density[n] + f[2] * density[n + 1])
         return total
 
@@ -42,22 +83,9 @@ def kernels(dtype: torch.dtype) -> SimpleNamespace:
 
     @kernel
     def march(
-        place: Place,
-        near: real,
-        step: real,
-        interval: real,
-        shift: real,
-        least: real,
-        end: real,
-        fill: wp.int32,
-        density: wp.array(dtype=real),
-        origins: wp.array(dtype=vec3),
-        directions: wp.array(dtype=vec3),
-        starts: wp.array(dtype=wp.int32),
-        points: wp.array(dtype=vec3),
-        rays: wp.array(dtype=wp.int64),
-        counts: wp.array(dtype=wp.int32),
-    ):
+        place, near, step, interval, shift, least, end, fill, density, origins, directions, starts, points, rays,
+        counts,
+    ):  # fmt: skip
         """Select points of a ray with a weight T alpha above `least`, until the transmittance T is below `end`.
 
         Counts the points, or writes them from `starts` on if `fill` is 1. Both passes select the same points.
@@ -90,15 +118,7 @@ def kernels(dtype: torch.dtype) -> SimpleNamespace:
             counts[r] = count
 
     @kernel
-    def composite(
-        background: vec3,
-        starts: wp.array(dtype=wp.int32),
-        alphas: wp.array(dtype=real),
-        colours: wp.array(dtype=vec3),
-        reaching: wp.array(dtype=real),
-        pictures: wp.array(dtype=vec3),
-        passed: wp.array(dtype=real),
-    ):
+    def composite(background, starts, alphas, colours, reaching, pictures, passed):
         """C = sum_i T_i alpha_i c_i + T background with T_i = prod_{j < i} (1 - alpha_j), stored in `reaching`."""
         r = wp.tid()
         transmitted = real(1.0)
@@ -112,15 +132,7 @@ def kernels(dtype: torch.dtype) -> SimpleNamespace:
 
     @kernel
     def composite_adjoint(
-        background: vec3,
-        starts: wp.array(dtype=wp.int32),
-        alphas: wp.array(dtype=real),
-        colours: wp.array(dtype=vec3),
-        reaching: wp.array(dtype=real),
-        grad_pictures: wp.array(dtype=vec3),
-        grad_passed: wp.array(dtype=real),
-        grad_alphas: wp.array(dtype=real),
-        grad_colours: wp.array(dtype=vec3),
+        background, starts, alphas, colours, reaching, grad_pictures, grad_passed, grad_alphas, grad_colours
     ):
         """Back to front, with the colour B and the transmittance P behind point i, which avoids division by 1 - alpha.
 

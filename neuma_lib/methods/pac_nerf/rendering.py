@@ -19,8 +19,7 @@ from torch.autograd.function import once_differentiable
 from neuma_lib.device import launch
 from neuma_lib.errors import InputError
 from neuma_lib.methods.pac_nerf.lattice import Lattice, interpolate
-from neuma_lib.methods.pac_nerf.lattice_kernels import lattice_types
-from neuma_lib.methods.pac_nerf.marching_kernels import kernels
+from neuma_lib.methods.pac_nerf.marching_kernels import kernels, place_of, warp_types
 from neuma_lib.splatting.cameras import Cameras
 
 FEATURES = 12
@@ -234,7 +233,7 @@ def _march(lattice, density, opacity, origins, directions, fill, starts, points,
             f" {origins.device}, do not match each other or values of {density.dtype} on {density.device}",
         )
     density, origins, directions = (value.detach().contiguous() for value in (density, origins, directions))
-    place, interval = lattice.place(density.dtype), opacity.ray_interval(lattice.voxel)
+    place, interval = place_of(lattice, density.dtype), opacity.ray_interval(lattice.voxel)
     constants = (place, NEAR, STEP * lattice.voxel, interval, opacity.shift, MIN_LIGHT, END_LIGHT)
     field = (density.view(-1), origins, directions)
     launch(kernels(density.dtype).march, len(origins), *constants, fill, *field, starts, points, rays, counts)
@@ -264,7 +263,7 @@ class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(ctx, background, starts, alphas, colours):
         alphas, colours = alphas.detach().contiguous(), colours.detach().contiguous()
-        behind = lattice_types(alphas.dtype).vec3(*background)
+        behind = warp_types(alphas.dtype).vec3(*background)
         R, reaching = len(starts) - 1, torch.empty_like(alphas)
         pictures, passed = alphas.new_empty(R, 3), alphas.new_empty(R)
         launch(

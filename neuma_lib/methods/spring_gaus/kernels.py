@@ -18,7 +18,7 @@ from types import SimpleNamespace
 import torch
 import warp as wp
 
-from neuma_lib.device import start_warp
+from neuma_lib.device import start_warp, typed
 
 start_warp()
 
@@ -52,7 +52,25 @@ def kernels(dtype: torch.dtype) -> SimpleNamespace:
     t = warp_types(dtype)
     real, vec3, SpringConstants = t.real, t.vec3, t.SpringConstants
     module = wp.get_module(f"{__name__}.{str(dtype).removeprefix('torch.')}")
-    kernel = functools.partial(wp.kernel, enable_backward=False, module=module)
+    types = {
+        "c": SpringConstants,
+        "now": wp.int32,
+        "after_side": wp.int32,
+        "neighbours": wp.array2d(dtype=wp.int32),  # (A, K)
+        "rest": wp.array2d(dtype=real),  # (A, K)
+        "stiffness": wp.array(dtype=real),  # (A,)
+        "eta": wp.array(dtype=real),  # (K,)
+        **dict.fromkeys(("damping", "friction", "gap"), wp.array(dtype=real)),  # (1,)
+        **dict.fromkeys(("x", "v"), wp.array2d(dtype=vec3)),  # (S + 1, A)
+        # (2, A): gradient of the state after the step, and zeros
+        **dict.fromkeys(("grad_x", "grad_v"), wp.array2d(dtype=vec3)),
+        # accumulated: (A,), and (A, K), contribution of each anchor
+        **dict.fromkeys(
+            ("grad_stiffness", "grad_damping", "grad_friction", "grad_gap"), wp.array(dtype=real)
+        ),
+        "grad_eta": wp.array2d(dtype=real),
+    }
+    kernel = typed(types).kernel(module)
 
     @wp.func(module=module)
     def power(u: real, p: real):
@@ -82,19 +100,7 @@ def kernels(dtype: torch.dtype) -> SimpleNamespace:
         return result
 
     @kernel
-    def step(
-        c: SpringConstants,
-        now: wp.int32,
-        neighbours: wp.array2d(dtype=wp.int32),  # (A, K)
-        rest: wp.array2d(dtype=real),  # (A, K)
-        stiffness: wp.array(dtype=real),  # (A,)
-        eta: wp.array(dtype=real),  # (K,)
-        damping: wp.array(dtype=real),  # (1,)
-        friction: wp.array(dtype=real),  # (1,)
-        gap: wp.array(dtype=real),  # (1,)
-        x: wp.array2d(dtype=vec3),  # (S + 1, A)
-        v: wp.array2d(dtype=vec3),
-    ):
+    def step(c, now, neighbours, rest, stiffness, eta, damping, friction, gap, x, v):
         i = wp.tid()
         xi, vi, ki, damp = x[now, i], v[now, i], stiffness[i], damping[0]
         force = vec3()
@@ -124,26 +130,9 @@ def kernels(dtype: torch.dtype) -> SimpleNamespace:
 
     @kernel
     def step_adjoint(
-        c: SpringConstants,
-        now: wp.int32,
-        after_side: wp.int32,
-        neighbours: wp.array2d(dtype=wp.int32),
-        rest: wp.array2d(dtype=real),
-        stiffness: wp.array(dtype=real),
-        eta: wp.array(dtype=real),
-        damping: wp.array(dtype=real),
-        friction: wp.array(dtype=real),
-        gap: wp.array(dtype=real),
-        x: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        grad_x: wp.array2d(dtype=vec3),  # (2, A): gradient of the state after the step, and zeros
-        grad_v: wp.array2d(dtype=vec3),
-        grad_stiffness: wp.array(dtype=real),  # (A,), accumulated like the four below
-        grad_eta: wp.array2d(dtype=real),  # (A, K), contribution of each anchor
-        grad_damping: wp.array(dtype=real),  # (A,)
-        grad_friction: wp.array(dtype=real),  # (A,)
-        grad_gap: wp.array(dtype=real),  # (A,)
-    ):
+        c, now, after_side, neighbours, rest, stiffness, eta, damping, friction, gap, x, v, grad_x, grad_v,
+        grad_stiffness, grad_eta, grad_damping, grad_friction, grad_gap,
+    ):  # fmt: skip
         """From gradients of the state after a step (cleared) to those of the state before it.
 
         Threads add to the gradients of neighbours, on a GPU in no fixed order.

@@ -1,11 +1,14 @@
-"""Several GPUs for the jobs of one Snakemake: with NEUMA_GPUS=2 each script sees one of two, shared out evenly.
+"""What Python does before a script of a job: disable garbage collection during imports, and choose a GPU.
 
-Python runs this file before a script, and so before torch, Warp or Blender look for devices. Each GPU has as many
-places as are asked for, and a script takes the lowest that is free on any; they are locked files, which the system
-frees when a process ends, however it ends.
+Imports create many objects and no garbage. `workflow.stage.run_script` enables collection again.
+
+With NEUMA_GPUS=2, each script sees one of two GPUs, shared out evenly. This must precede torch, Warp and Blender, which
+look for devices. Each GPU has as many places as are asked for, and a script takes the lowest that is free on any. They
+are locked files, which the system frees when a process ends, however it ends.
 """
 
 import fcntl
+import gc
 import os
 import platform
 import sys
@@ -30,10 +33,8 @@ def claim_gpu(gpus: int) -> tuple[int, object]:
 
 
 # sys.argv is not there yet.
-if (
-    os.environ.get("NEUMA_GPUS", "").isdigit()
-    and "CUDA_VISIBLE_DEVICES" not in os.environ
-    and any(f"{os.sep}.snakemake{os.sep}scripts{os.sep}" in word for word in sys.orig_argv[:4])
-):
-    _gpu, _claim = claim_gpu(max(1, int(os.environ["NEUMA_GPUS"])))
-    os.environ["CUDA_VISIBLE_DEVICES"] = str(_gpu)
+if any(f"{os.sep}.snakemake{os.sep}scripts{os.sep}" in word for word in sys.orig_argv[:4]):
+    gc.disable()
+    if os.environ.get("NEUMA_GPUS", "").isdigit() and "CUDA_VISIBLE_DEVICES" not in os.environ:
+        _gpu, _claim = claim_gpu(max(1, int(os.environ["NEUMA_GPUS"])))
+        os.environ["CUDA_VISIBLE_DEVICES"] = str(_gpu)

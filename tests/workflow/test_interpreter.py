@@ -1,4 +1,4 @@
-"""Jobs of one Snakemake on several GPUs: each script gets one."""
+"""What Python does before a script: several GPUs for the jobs of one Snakemake, and no collection of garbage."""
 
 import os
 import subprocess
@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-GPUS = Path(__file__).parents[2] / "workflow" / "gpus"
+ROOT = Path(__file__).parents[2]
+INTERPRETER = ROOT / "workflow" / "interpreter"
 SCRIPT = "import os\nprint(os.environ.get('CUDA_VISIBLE_DEVICES'), flush=True)\ninput()\n"
 
 
@@ -22,7 +23,12 @@ def start(tmp_path):
         script.parent.mkdir(parents=True, exist_ok=True)
         script.write_text(SCRIPT)
         known = {name: value for name, value in os.environ.items() if name != "CUDA_VISIBLE_DEVICES"}
-        known |= {"PYTHONPATH": str(GPUS), "XDG_CACHE_HOME": str(tmp_path), "NEUMA_GPUS": "2", **variables}
+        known |= {
+            "PYTHONPATH": str(INTERPRETER),
+            "XDG_CACHE_HOME": str(tmp_path),
+            "NEUMA_GPUS": "2",
+            **variables,
+        }
         process = subprocess.Popen(
             [sys.executable, script], env=known, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         )
@@ -50,3 +56,22 @@ def test_others_and_the_choice_of_a_user_are_left_alone(start):
     assert start(folder="elsewhere")[1] == "None"
     assert start(NEUMA_GPUS="")[1] == "None"
     assert start(CUDA_VISIBLE_DEVICES="7")[1] == "7"
+
+
+def test_garbage_is_collected_from_the_stage_on_without_the_objects_of_imports(tmp_path):
+    script = tmp_path / ".snakemake" / "scripts" / "job.py"
+    script.parent.mkdir(parents=True)
+    script.write_text("""
+import gc
+from types import SimpleNamespace
+assert not gc.isenabled()
+from workflow.stage import run_script
+about = {name: {} for name in ("config", "input", "output", "params")}
+snakemake = SimpleNamespace(rule="job", wildcards=[], log=["job.log"], **about)
+run_script(lambda *parts: print(gc.isenabled(), gc.get_freeze_count() > 10_000), snakemake)
+""")
+    path = os.pathsep.join([str(INTERPRETER), str(ROOT)])
+    done = subprocess.run(
+        [sys.executable, script], cwd=tmp_path, env=os.environ | {"PYTHONPATH": path}, stdout=subprocess.PIPE
+    )
+    assert done.stdout == b"True True\n"
