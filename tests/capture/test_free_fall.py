@@ -68,7 +68,7 @@ def test_one_camera_measures_gravity_in_the_plane_of_the_fall():
 
 def test_a_mismatch_names_the_likely_causes():
     slow = fit_free_fall([track((2.0, 1.0, 0.3), stretch=4.0), track((0.2, 1.1, 2.2), stretch=4.0)])
-    with pytest.raises(InputError, match=r"(?s)square size.*frame rate is 4\.00.*time base"):
+    with pytest.raises(InputError, match=r"(?s)square size.*frame rate is 4\.00.*time base.*row_time"):
         slow.gravity.check("drop")
     with pytest.raises(InputError, match="drop: .*floor or board"):
         fit_free_fall(two()).gravity.check("drop", normal=(0.2, 1.0, 0.0))

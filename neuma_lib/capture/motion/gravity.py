@@ -104,6 +104,7 @@ class Gravity:
                 f"the frame rate is {ratio**-0.5:.2f} of the assumed one (set the true rate of slow motion)"
             )
             causes.append("the time base is not constant (use the original file of the camera)")
+            causes.append("the camera reads its rows one after the other (set `row_time`)")
         if angle > np.degrees(_MAX_MISMATCH / 2):
             causes.append("the floor or board is not level, or the camera moved after its pose was estimated")
         if self.several:
