@@ -11,7 +11,6 @@ import numpy as np
 
 from neuma_lib.config.base import Vector
 from neuma_lib.config.laws import LawConfig
-from neuma_lib.errors import InputError
 from neuma_lib.project.random_scenes import (
     ATTEMPTS,
     MARGIN,
@@ -25,6 +24,7 @@ from neuma_lib.project.random_scenes import (
     flight,
     largest_stable,
     rounded,
+    unusable,
 )
 
 REJECTIONS = {
@@ -69,11 +69,7 @@ def draw_piles(
                     break
                 rejected[reason] += 1
             else:
-                reasons = ", ".join(f"{n} {REJECTIONS[reason]}" for reason, n in rejected.most_common())
-                problem = (
-                    f"{ATTEMPTS} draws of a {shape} next to {len(placed)} bodies are unusable: {reasons}"
-                )
-                raise InputError("random", problem, "Change the ranges")
+                raise unusable(f"a {shape} next to {len(placed)} bodies", rejected, REJECTIONS)
             bodies.append(body)
             placed.append(fall)
         dt = largest_stable(settings, [body["law"] for body in bodies], grid)

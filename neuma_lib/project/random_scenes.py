@@ -259,14 +259,18 @@ def draw_scenes(
                 break
             rejected[reason] += 1
         else:
-            reasons = ", ".join(f"{number} {REJECTIONS[reason]}" for reason, number in rejected.most_common())
-            problem = f"{ATTEMPTS} draws of a {shape} of the family {family} are unusable: {reasons}"
-            raise InputError("random", problem, "Change the ranges")
+            raise unusable(f"a {shape} of the family {family}", rejected, REJECTIONS)
         scene |= {"dt": dt, "steps": STEPS * max(1, round(scene.pop("duration") / dt / STEPS))}
         scene |= contact_and_truth(settings, k)
         scene["appearance"] = appearance(settings, k, shape, family)
         scenes[f"{settings.prefix}{k:02d}_{shape}_{family}"] = scene
     return scenes
+
+
+def unusable(what: str, rejected: Counter[str], reasons: Mapping[str, str]) -> InputError:
+    """The error that all draws are unusable, with the number of draws for each of the reasons."""
+    counts = ", ".join(f"{number} {reasons[reason]}" for reason, number in rejected.most_common())
+    return InputError("random", f"{ATTEMPTS} draws of {what} are unusable: {counts}", "Change the ranges")
 
 
 def _dealt(items: Sequence[Item], seed: int, deck: int, k: int) -> Item:
