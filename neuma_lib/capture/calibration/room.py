@@ -145,8 +145,8 @@ def room_of(
     level = [cues[0].up, MAX_ANGLE + 2 * cues[0].deviation] if cues else []
     middle, boxed = np.median(poses.points, axis=0), _boxed(poses, settings, orientations or {})
     regions = [(poses.points, centres, away)]
-    if (found := locate(*boxed)) is not None:
-        middle, size = found
+    if (located := locate(*boxed)) is not None:
+        middle, size = located
         points = poses.points[np.linalg.norm(poses.points - middle, axis=1) < _SUPPORT * size]
         if len(points) >= _MIN_SUPPORT:
             away = np.median(np.linalg.norm(centres - middle, axis=1))
@@ -159,8 +159,8 @@ def room_of(
                 raise
         else:
             break
-    if (found := locate(*boxed, (point, normal))) is not None:
-        middle = found[0]
+    if (located := locate(*boxed, (point, normal))) is not None:
+        middle = located[0]
     level = upright(normal, middle - ((middle - point) @ normal) * normal)
     if settings.length is None:
         scale, source = 1 / max(away, 1e-12), None

@@ -232,7 +232,14 @@ def _masks(
     progress: Callable[[int, int], None] | None = None,
 ) -> list[np.ndarray]:
     """Masks of `selected_masks`, from boxes only, which they need not fill."""
-    centre, size = locate(viewmats, Ks, boxes, points, seen, (np.array([0, floor, 0.0]), np.array(UP)))
+    located = locate(viewmats, Ks, boxes, points, seen, (np.array([0, floor, 0.0]), np.array(UP)))
+    if located is None:
+        raise InputError(
+            name,
+            "neither points of the reconstruction nor the floor determine the distance of the object in the box",
+            "Draw the box in a photograph that looks down at the object",
+        )
+    centre, size = located
     half = _REACH * size
     ticks = ((np.arange(_VOXELS) + 0.5) / _VOXELS * 2 - 1) * half
     voxels = np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), axis=-1).reshape(-1, 3) + centre
