@@ -264,7 +264,9 @@ def list_body(source: str | Path, path: str | Path, body: int) -> tuple[int, int
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     frames = []
     for frame, pixels, label in zip(data.pop("frames"), images, labels, strict=True):
-        nearest = ndimage.distance_transform_edt(label == 0, return_distances=False, return_indices=True)
+        nearest = np.asarray(
+            ndimage.distance_transform_edt(label == 0, return_distances=False, return_indices=True)
+        )
         edge = (label == 0) & (pixels[..., 3] <= 127)
         alpha = np.where(np.where(edge, label[tuple(nearest)], label) == body, pixels[..., 3], 0)
         if not (alpha > 127).any():
