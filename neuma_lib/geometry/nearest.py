@@ -1,7 +1,7 @@
 """Nearest neighbours between many pairs of point sets at once, on their device.
 
-The points of a set are sorted into the cubic cells of a grid. A search begins in the cell of the query and proceeds in
-rings of cells until no point outside can be nearer, so the result is exact at any distance.
+The points of a set are sorted into the cubic cells of a grid. A search begins in the cell nearest to the query and
+proceeds outwards over planes and rows of cells as far as a point can be nearer, so the result is exact at any distance.
 """
 
 # No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
@@ -25,31 +25,32 @@ def _search_kernel(dtype: torch.dtype) -> wp.Kernel:
     module = wp.get_module(f"{__name__}.{str(dtype).removeprefix('torch.')}")
 
     @wp.func
-    def beyond(q: vec3, c: wp.vec3i, shape: wp.vec3i, width: real, ring: wp.int32):
-        """Lower bound of the squared distance from q to the points outside the rings 0 .. ring about its cell c.
-
-        Infinite if the rings cover the grid. Positions are relative to the corner of the grid.
-        """
-        out = vec3()  # distance from q to the grid along each axis
-        for a in range(3):
-            out[a] = wp.max(wp.max(-q[a], q[a] - width * real(shape[a])), real(0.0))
-        bound = real(wp.inf)
-        for a in range(3):
-            along = real(wp.inf)
-            if c[a] - ring > 0:
-                along = q[a] - width * real(c[a] - ring)
-            if c[a] + ring + 1 < shape[a]:
-                along = wp.min(along, width * real(c[a] + ring + 1) - q[a])
-            along = wp.max(along, real(0.0))
-            bound = wp.min(bound, along * along + wp.dot(out, out) - out[a] * out[a])
-        return bound
-
-    @wp.func
     def apart(q: real, i: wp.int32, width: real):
         """Squared distance from a coordinate to an interval of cells, less a hundredth of a cell for round-off."""
         low = width * (real(i) - real(0.01)) - q
         outside = wp.max(wp.max(low, -low - real(1.02) * width), real(0.0))
         return outside * outside
+
+    @wp.func
+    def cell(q: real, count: wp.int32, width: real):
+        """Index of the cell nearest to a coordinate."""
+        return wp.int32(wp.clamp(wp.floor(q / width), real(0.0), real(count - 1)))
+
+    @wp.func
+    def cells(q: real, squared: real, count: wp.int32, width: real):
+        """First and last cell that may be within a distance of a coordinate, if any is."""
+        reach = wp.sqrt(wp.max(squared, real(0.0))) + real(0.01) * width
+        return wp.vec2i(cell(q - reach, count, width), cell(q + reach, count, width))
+
+    @wp.func
+    def outwards(k: wp.int32, start: wp.int32):
+        """The k-th of the cells on both sides of a first one: 0, -1, 1, -2 ... from there."""
+        return start + wp.where(k % 2 == 0, k // 2, -(k + 1) // 2)
+
+    @wp.func
+    def turns(start: wp.int32, ends: wp.vec2i):
+        """Number of cells of `outwards` that hold all from the first to the last."""
+        return 2 * wp.max(start - ends[0], ends[1] - start) + 1
 
     @wp.kernel(enable_backward=False, module=module)
     def search(
@@ -68,29 +69,35 @@ def _search_kernel(dtype: torch.dtype) -> wp.Kernel:
         s = of[k]
         w, n = width[s], shape[s]
         q = queries[k] - corner[s]
-        c = wp.vec3i()
-        for a in range(3):
-            c[a] = wp.clamp(wp.int32(wp.floor(wp.clamp(q[a] / w, real(-1.0), real(n[a])))), 0, n[a] - 1)
+        a, b, c = cell(q[0], n[0], w), cell(q[1], n[1], w), cell(q[2], n[2], w)
         best, closest = real(wp.inf), wp.int32(-1)
-        for ring in range(wp.max(n[0], wp.max(n[1], n[2]))):
-            for i in range(wp.max(c[0] - ring, 0), wp.min(c[0] + ring + 1, n[0])):
-                across = apart(q[0], i, w)
-                if across > best:
+        own = first[s] + (a * n[1] + b) * n[2] + c
+        for p in range(starts[own], starts[own + 1]):  # a first bound
+            offset = points[p] - queries[k]
+            distance = wp.dot(offset, offset)
+            if distance < best:
+                best, closest = distance, p
+        planes = cells(q[0], best, n[0], w)
+        for u in range(turns(a, planes)):
+            i = outwards(u, a)
+            if i < planes[0] or i > planes[1]:
+                continue
+            across = apart(q[0], i, w)
+            if across > best:
+                continue
+            rows = cells(q[1], best - across, n[1], w)
+            for v in range(turns(b, rows)):
+                j = outwards(v, b)
+                if j < rows[0] or j > rows[1]:
                     continue
-                for j in range(wp.max(c[1] - ring, 0), wp.min(c[1] + ring + 1, n[1])):
-                    to_row, row = across + apart(q[1], j, w), first[s] + (i * n[1] + j) * n[2]
-                    side = wp.abs(i - c[0]) == ring or wp.abs(j - c[1]) == ring
-                    stride = wp.where(side or ring == 0, 1, 2 * ring)
-                    if to_row <= best and starts[row] < starts[row + n[2]]:
-                        for m in range(c[2] - ring, c[2] + ring + 1, stride):
-                            if m >= 0 and m < n[2] and to_row + apart(q[2], m, w) <= best:
-                                for p in range(starts[row + m], starts[row + m + 1]):
-                                    offset = points[p] - queries[k]
-                                    distance = wp.dot(offset, offset)
-                                    if distance < best:
-                                        best, closest = distance, p
-            if best <= beyond(q, c, n, w, ring):
-                break
+                to_row, row = across + apart(q[1], j, w), first[s] + (i * n[1] + j) * n[2]
+                if to_row <= best and starts[row] < starts[row + n[2]]:
+                    ends = cells(q[2], best - to_row, n[2], w)
+                    for p in range(starts[row + ends[0]], starts[row + ends[1] + 1]):
+                        offset = points[p] - queries[k]
+                        distance = wp.dot(offset, offset)
+                        if distance < best:
+                            best, closest = distance, p
         out[k] = closest
 
     return search
