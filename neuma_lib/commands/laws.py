@@ -145,7 +145,7 @@ def _print_material(target: str, material: Any, notes: list[str]) -> None:
         print(f"note: {note}")
 
 
-def _visited_states(known: dict[str, Any], count: int = 4000) -> Any:
+def _visited_states(known: dict[str, Any]) -> Any:
     """Elastic states (N, 3, 3) of the motion of a method's folder, None without one."""
     if "rollout" not in known:
         return None
@@ -156,7 +156,7 @@ def _visited_states(known: dict[str, Any], count: int = 4000) -> Any:
 
     F = torch.from_numpy(read_arrays(known["rollout"], required=("F",), only=("F",))[0]["F"])
     F = F[deformed_frames(F)].reshape(-1, 3, 3)
-    return F[:: max(1, len(F) // count)] if len(F) else None
+    return F[:: max(1, len(F) // 4000)] if len(F) else None
 
 
 def _import(options: argparse.Namespace) -> None:

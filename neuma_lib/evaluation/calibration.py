@@ -127,7 +127,7 @@ def family_probabilities(identified: Mapping[str, Any], temperature: float | Non
     return dict(ranked)
 
 
-def describe_families(identified: Mapping[str, Any], smallest: float = 0.01) -> str:
-    """Families with their probabilities in percent, without those below ``smallest``."""
+def describe_families(identified: Mapping[str, Any]) -> str:
+    """Families with their probabilities in percent, without those below 1 %."""
     known = family_probabilities(identified)
-    return ", ".join(f"{name} {100 * p:.0f} %" for name, p in known.items() if p >= smallest)
+    return ", ".join(f"{name} {100 * p:.0f} %" for name, p in known.items() if p >= 0.01)

@@ -217,8 +217,8 @@ class _Search:
             video.rollouts,
         )
 
-    def _together(self, known: Values | None = None) -> Bodies:
-        return Bodies(dict(zip(self.names, self.families, strict=True)), self.pairs, known)
+    def _together(self) -> Bodies:
+        return Bodies(dict(zip(self.names, self.families, strict=True)), self.pairs)
 
     def _of_body(self, k: int) -> Values:
         return self._together().of_body(k, self.values)

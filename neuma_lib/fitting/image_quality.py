@@ -31,13 +31,13 @@ def image_loss(pictures: Tensor, targets: Tensor, ssim_weight: float) -> Tensor:
     return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim_map(pictures, targets).mean())
 
 
-def ssim_map(a: Tensor, b: Tensor, sigma: float = 1.5, radius: int = 5) -> Tensor:
+def ssim_map(a: Tensor, b: Tensor) -> Tensor:
     """SSIM (B, 3, H, W) of (B, H, W, 3) images in [0, 1]: 11 x 11 Gaussian window, zeros outside.
 
     The window is applied as two banded matrices by GEMM, which is faster than a small convolution.
     """
     a, b = (image.movedim(-1, 1) for image in (a, b))
-    rows, columns = (_window(n, sigma, radius, a.dtype, a.device) for n in a.shape[-2:])
+    rows, columns = (_window(n, a.dtype, a.device) for n in a.shape[-2:])
     maps = rows @ torch.stack([a, b, a * a, b * b, a * b]) @ columns.mT
     mean_a, mean_b, aa, bb, ab = maps
     product, squares = mean_a * mean_b, mean_a * mean_a + mean_b * mean_b
@@ -46,7 +46,8 @@ def ssim_map(a: Tensor, b: Tensor, sigma: float = 1.5, radius: int = 5) -> Tenso
 
 
 @functools.lru_cache(maxsize=8)
-def _window(size: int, sigma: float, radius: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+def _window(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    sigma, radius = 1.5, 5
     positions = torch.arange(size, dtype=torch.float64)
     offsets = positions[:, None] - positions
     weights = torch.exp(-(offsets**2) / (2 * sigma**2)) * (offsets.abs() <= radius)

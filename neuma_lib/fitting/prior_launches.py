@@ -106,12 +106,12 @@ def random_rotations(count: int, generator: torch.Generator) -> Tensor:
     ).reshape(-1, 3, 3)
 
 
-def visited_stretches(launch: Launch, law: Law, every: int = 8) -> tuple[Tensor, Tensor]:
+def visited_stretches(launch: Launch, law: Law) -> tuple[Tensor, Tensor]:
     """Principal stretches of F and of F_trial in a rollout, (M, 3) each.
 
     F_trial = (I + dt C) F from pairs of consecutive frames.
     """
-    firsts = list(range(0, launch.steps - 1, every))
+    firsts = list(range(0, launch.steps - 1, 8))
     frames = sorted({n for first in firsts for n in (first, first + 1)})
     path = launch.run(law, frames)
     before = [frames.index(n) for n in firsts]

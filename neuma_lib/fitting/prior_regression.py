@@ -143,15 +143,14 @@ def _crushed(stretches: Tensor) -> Tensor:
     return stretches.amin(1) < STRETCH_MIN
 
 
-def plastic_errors(
-    law: Law, reference: Law, pool: Tensor, generator: torch.Generator, count: int = 20000
-) -> dict[str, float]:
+def plastic_errors(law: Law, reference: Law, pool: Tensor, generator: torch.Generator) -> dict[str, float]:
     """Errors of the plastic correction F - F_trial of a step on visited stretches (M, 3).
 
     Returns:
         ``elastic_error``: mean norm of the correction at elastic states; ``yield_error``: mean norm of the error
         divided by the mean norm of the correction at yielding states. Zero if there are no such states.
     """
+    count = 20000
     sigma = pool[torch.randint(len(pool), (count,), generator=generator)]
     F = sigma[:, :, None] * random_rotations(count, generator)
     true = reference.plasticity.evaluate(F, ()) - F

@@ -13,15 +13,17 @@ from scipy.spatial import cKDTree
 
 from neuma_lib.errors import InputError
 
+_NEIGHBOURS = (
+    32  # of a vertex. The farthest has no weight, so that coefficients are continuous along the surface
+)
 
-def skinning_matrix(vertices: np.ndarray, particles: np.ndarray, neighbours: int = 32) -> csr_matrix:
+
+def skinning_matrix(vertices: np.ndarray, particles: np.ndarray) -> csr_matrix:
     """Coefficients that move vertices with particles.
 
     Args:
         vertices: rest positions [m], shape (n, 3).
         particles: rest positions of the particles that fill the body [m], shape (N, 3).
-        neighbours: number of particles per vertex; the weight of the farthest is zero, so that the coefficients are
-            continuous along the surface.
 
     Returns:
         Matrix (n, N) with rows that sum to 1; ``matrix @ x_t`` are the vertices at time t. It maps rest particles to
@@ -33,7 +35,7 @@ def skinning_matrix(vertices: np.ndarray, particles: np.ndarray, neighbours: int
     vertices, particles = np.asarray(vertices, dtype=np.float64), np.asarray(particles, dtype=np.float64)
     if len(particles) < 8:
         raise InputError("skinning: particles", f"{len(particles)} are too few, at least 8 are needed")
-    k = min(neighbours, len(particles) - 1)
+    k = min(_NEIGHBOURS, len(particles) - 1)
     distance, index = cKDTree(particles).query(vertices, k=k + 1)
     radius = distance[:, -1:]
     ratio = distance[:, :k] / radius

@@ -152,11 +152,11 @@ def existing(path: str | Path, remedy: str = "Run the stage that writes it, or c
     return path
 
 
-def read_regular(path: str | Path, limit: int = 2**28) -> bytes:
-    """Content of a regular file of at most ``limit`` bytes. Raises InputError for others, which may never end."""
+def read_regular(path: str | Path) -> bytes:
+    """Content of a regular file of at most 2^28 bytes. Raises InputError for others, which may never end."""
     path = existing(path, "Put the file there, or correct its name")
-    if path.stat().st_size > limit:
-        raise InputError(path, f"is larger than {limit} bytes", "Replace it by a smaller file")
+    if path.stat().st_size > 2**28:
+        raise InputError(path, f"is larger than {2**28} bytes", "Replace it by a smaller file")
     return path.read_bytes()
 
 

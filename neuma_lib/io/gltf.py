@@ -28,6 +28,7 @@ def write_glb(
     times: np.ndarray,
     colors: np.ndarray,
     obstacles: Sequence[Obstacle] = (),
+    bodies: Sequence[tuple[str, int]] = (),
 ) -> None:
     """Write a moving surface, y up and in metres as glTF requires.
 
@@ -37,6 +38,7 @@ def write_glb(
         times: (T,) ascending [s]; vertices are interpolated linearly in between.
         colors: (V, 3) sRGB in [0, 1].
         obstacles: other nodes of the scene, with a pose at each time.
+        bodies: names and numbers of vertices of the bodies in their order, each a node of its name; (): one body.
     """
     vertices = np.asarray(vertices, "<f4")
     frames, body, views, accessors = len(vertices), bytearray(), [], []
@@ -53,35 +55,42 @@ def write_glb(
         accessors.append(entry)
         return len(accessors) - 1
 
-    indices = add(np.asarray(faces, "<u4").ravel(), "SCALAR", _FACES)
-    attributes = {"POSITION": add(vertices[0], "VEC3", _VERTICES, bounds=True)}
-    attributes["COLOR_0"] = add(linear(colors).astype("<f4"), "VEC3", _VERTICES)
-    targets = [
-        {"POSITION": add(frame - vertices[0], "VEC3", _VERTICES, bounds=True)} for frame in vertices[1:]
-    ]
+    colors, first, meshes = linear(colors).astype("<f4"), 0, []
+    for name, count in bodies or [("body", vertices.shape[1])]:
+        own = slice(first, first + count)
+        faces_of = np.asarray(faces)[(faces[:, 0] >= own.start) & (faces[:, 0] < own.stop)] - first
+        part, first = vertices[:, own], own.stop
+        indices = add(np.asarray(faces_of, "<u4").ravel(), "SCALAR", _FACES)
+        attributes = {"POSITION": add(part[0], "VEC3", _VERTICES, bounds=True)}
+        attributes["COLOR_0"] = add(colors[own], "VEC3", _VERTICES)
+        primitive: dict[str, Any] = {"attributes": attributes, "indices": indices, "material": 0}
+        mesh: dict[str, Any] = {"name": name, "primitives": [primitive]}
+        if frames > 1:  # glTF does not allow empty lists
+            targets = [add(frame - part[0], "VEC3", _VERTICES, bounds=True) for frame in part[1:]]
+            primitive["targets"] = [{"POSITION": target} for target in targets]
+            mesh["weights"] = [0.0] * (frames - 1)
+        meshes.append(mesh)
     weights = np.eye(frames, dtype="<f4")[:, 1:]  # the first frame is the mesh itself
     animated = {
         "input": add(np.asarray(times, "<f4"), "SCALAR", bounds=True),
         "output": add(weights.reshape(-1, 1), "SCALAR"),
         "interpolation": "LINEAR",
     }
-    primitive = {"attributes": attributes, "indices": indices, "material": 0, "targets": targets}
-    content = {
+    channels = [{"sampler": 0, "target": {"node": k, "path": "weights"}} for k in range(len(meshes))]
+    content: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "neuma_lib"},
         "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "name": "body"}],
-        "meshes": [{"name": "body", "primitives": [primitive], "weights": [0.0] * (frames - 1)}],
+        "scenes": [{"nodes": list(range(len(meshes)))}],
+        "nodes": [{"mesh": k, "name": mesh["name"]} for k, mesh in enumerate(meshes)],
+        "meshes": meshes,
         "materials": [{"pbrMetallicRoughness": _ROUGH}],
-        "animations": [
-            {"samplers": [animated], "channels": [{"sampler": 0, "target": {"node": 0, "path": "weights"}}]}
-        ],
+        "animations": [{"samplers": [animated], "channels": channels}],
         "accessors": accessors,
         "bufferViews": views,
         "buffers": [{"byteLength": len(body)}],
     }
-    if frames == 1:  # glTF does not allow empty lists
-        del content["animations"], primitive["targets"], content["meshes"][0]["weights"]
+    if frames == 1:
+        del content["animations"]
     for k, obstacle in enumerate(obstacles, 1):
         corners = {"POSITION": add(np.asarray(obstacle.vertices, "<f4"), "VEC3", _VERTICES, bounds=True)}
         triangles = add(np.asarray(obstacle.faces, "<u4").ravel(), "SCALAR", _FACES)
@@ -93,13 +102,16 @@ def write_glb(
         turns[1:] *= np.cumprod(np.where((turns[1:] * turns[:-1]).sum(1, keepdims=True) < 0, -1, 1), axis=0)
         motion = {"translation": obstacle.poses[:, :3, 3], "rotation": turns}
         start = {name: values[0].tolist() for name, values in motion.items()}
-        content["nodes"].append({"mesh": k, "name": f"obstacle {k}", **start})
-        content["scenes"][0]["nodes"].append(k)
+        node = len(content["nodes"])
+        content["nodes"].append({"mesh": node, "name": f"obstacle {k}", **start})
+        content["scenes"][0]["nodes"].append(node)
         for name, values in motion.items() if obstacle.moves else ():
             moved = content["animations"][0]
             kind = "VEC3" if name == "translation" else "VEC4"
             output = add(np.asarray(values, "<f4"), kind)
-            moved["channels"].append({"sampler": len(moved["samplers"]), "target": {"node": k, "path": name}})
+            moved["channels"].append(
+                {"sampler": len(moved["samplers"]), "target": {"node": node, "path": name}}
+            )
             moved["samplers"].append(animated | {"output": output})
     content["buffers"][0]["byteLength"] = len(body)
     text = json.dumps(content, separators=(",", ":")).encode()

@@ -38,10 +38,3 @@ def read_markers(path: str | Path, names: Sequence[str]) -> MarkerTracks:
         raise InputError(path, f"has no column {missing[0]}. Its columns are {', '.join(header)}")
     positions = table[:, [header.index(name) for name in columns]].reshape(len(table), len(names), 3)
     return MarkerTracks(table[:, header.index(TIME)], UNITS[unit] * positions)
-
-
-def write_markers(path: str | Path, tracks: MarkerTracks, names: Sequence[str]) -> None:
-    """Write such a file, in mm."""
-    columns = [f"{name}_{axis}_mm" for name in names for axis in "xyz"]
-    values = np.column_stack([tracks.times, 1e3 * tracks.positions.reshape(len(tracks.times), -1)])
-    np.savetxt(path, values, fmt="%.6g", delimiter=",", header=",".join([TIME, *columns]), comments="")

@@ -38,6 +38,18 @@ def test_the_track_is_detected_next_to_a_larger_hand_and_flicker():
     np.testing.assert_allclose(first.place(TIMES[20]), ball[20], atol=0.5)
 
 
+def test_what_rolls_on_a_line_is_no_flight_next_to_one():
+    """It is seen longer than the object, and its path is curved a little: by perspective, or by noise."""
+    ball = flight(TIMES)
+    ball[15:] = np.nan
+    rolling = flight(TIMES, x=300.0, vx=90.0, vy=-9.0, a=10.0)
+    seen = candidates((rolling, 700.0), (ball, 500.0), noise=0.3)
+    (track,) = find_ballistic_tracks(seen, TIMES, down=np.array([0.0, 1.0]))
+    assert track.frames == (0, 14) and set(track.candidates.values()) == {1}
+    (alone,) = find_ballistic_tracks(candidates((rolling, 700.0), noise=0.3), TIMES)
+    assert alone.frames == (0, 39)  # with nothing else in motion, the flight may be too short to be curved
+
+
 def test_a_bounce_makes_two_tracks_in_the_order_of_time():
     down, up = flight(TIMES[:20], vy=0), flight(TIMES[:20], y=0.0, vy=-600.0)
     up[:, 1] += down[-1, 1]

@@ -65,15 +65,35 @@ def test_a_point_selects_the_object(room):
     assert np.mean(ious) > GOAL - 0.01 and min(ious) > 0.85
 
 
-def test_without_points_two_boxes_locate_the_object(room):
+def test_without_points_on_the_object_the_floor_locates_it(room):
+    """Points of the floor behind an object without texture are not its own."""
     first = largest(room)
-    unknown = {"points": np.zeros((0, 3)), "seen": np.zeros((len(room.masks), 0), bool)}
-    with refused("capture"):
-        select(room, {first: box_around(room.masks[first])}, **unknown)
-    second = (first + 4) % len(room.masks)
-    boxes = {k: box_around(room.masks[k]) for k in (first, second)}
-    ious = [iou(a, b) for a, b in zip(select(room, boxes, **unknown), room.masks)]
-    assert np.mean(ious) > 0.9
+    none = {"points": np.zeros((0, 3)), "seen": np.zeros((len(room.masks), 0), bool)}
+    low = room.points[:, 1] < 0.01
+    below = {"points": room.points[low], "seen": room.seen[:, low]}
+    for points in (none, below):
+        masks = select(room, {first: box_around(room.masks[first])}, **points)
+        assert np.mean([iou(a, b) for a, b in zip(masks, room.masks)]) > 0.9
+
+
+def test_a_ball_on_the_floor_is_located_by_its_box():
+    """Exact up to the perspective of a ball, (radius / distance)^2 = 0.6 %, in a camera that is turned at random."""
+    rng = np.random.default_rng(0)
+    eye, centre, radius = np.array([0.3, 0.9, -0.8]), np.array([0.1, 0.1, 0.2]), 0.1
+    ray = (centre - eye) / np.linalg.norm(centre - eye)
+    across = np.cross(ray, rng.normal(size=3))
+    across /= np.linalg.norm(across)
+    rotation = np.stack([across, np.cross(ray, across), ray])
+    viewmat = np.eye(4)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ eye
+    K = np.array([[500.0, 0, 320], [0, 500.0, 240], [0, 0, 1]])
+    half = 500 * radius / np.linalg.norm(centre - eye)
+    box = Box(np.array([320 - half, 240 - half]), np.array([320 + half, 240 + half]))
+    arguments = viewmat[None], K[None], {0: box}, np.zeros((0, 3)), np.zeros((1, 0), bool)
+    place, size = module.locate(*arguments, (np.zeros(3), np.array([0, 1.0, 0])))
+    np.testing.assert_allclose(place, centre, atol=0.006 * np.linalg.norm(centre - eye))
+    np.testing.assert_allclose(size, radius, rtol=0.006)
+    assert module.locate(*arguments) is None
 
 
 def test_a_box_that_is_much_larger_than_the_object_is_refused(room):

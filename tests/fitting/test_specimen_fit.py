@@ -14,12 +14,13 @@ from neuma_lib.fitting import specimen_fit
 from neuma_lib.fitting.families import Family
 from neuma_lib.fitting.specimen_fit import Place, Record, fit_specimen, numerical_damping, specimen_problem
 from neuma_lib.fitting.vibration import fit_vibration
-from neuma_lib.io.markers import read_markers, write_markers
+from neuma_lib.io.markers import read_markers
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.sim.clamps import Clamp
 from neuma_lib.sim.equilibrium import solve_equilibrium
 from neuma_lib.sim.settle import settle
 from tests.support.errors import refused
+from tests.support.markers import write_markers
 
 BEAM = Beam(0.1, 0.03, 0.03, 1070.0)
 LAW = {

@@ -52,6 +52,28 @@ def moved(body, A):
     return body.x0 @ A.T + SHIFT, A.expand(len(body.x0), 3, 3).contiguous()
 
 
+def test_bodies_of_a_surface_are_nodes_with_their_names(tmp_path):
+    """Two moving cubes of one mesh: an independent reader finds each by its name, with its vertices and colours."""
+    cube, times = trimesh.creation.box((0.1, 0.1, 0.1)), np.array([0.0, 0.5])
+    both = trimesh.util.concatenate([cube, cube.subdivide()])
+    counts = [len(cube.vertices), len(both.vertices) - len(cube.vertices)]
+    vertices = np.stack([both.vertices, both.vertices + 0.2])
+    colors = np.repeat([[1.0, 0, 0], [0, 0, 1.0]], counts, axis=0)
+    names = list(zip(("duck", "ball"), counts, strict=True))
+    write_glb(tmp_path / "a.glb", vertices, both.faces, times, colors, bodies=names)
+    scene = trimesh.load(tmp_path / "a.glb", process=False)
+    assert set(scene.geometry) == {"duck", "ball"}
+    content = json.loads((tmp_path / "a.glb").read_bytes()[20:].split(b"BIN")[0][:-4].decode().rstrip())
+    assert [channel["target"]["node"] for channel in content["animations"][0]["channels"]] == [0, 1]
+    for (name, count), color, first in zip(names, ([255, 0, 0], [0, 0, 255]), (0, counts[0]), strict=True):
+        part = scene.geometry[name]
+        np.testing.assert_allclose(part.vertices, both.vertices[first : first + count], atol=1e-7)
+        assert part.is_watertight
+        np.testing.assert_array_equal(
+            part.visual.vertex_attributes["color"][:, :3], np.tile(color, (count, 1)) / 255
+        )
+
+
 def test_scales_and_rotations_make_the_covariances_again():
     g = ball(500).to(dtype=torch.float64)
     flat = dataclasses.replace(g, scales=g.scales * torch.tensor([1.0, 0.1, 1e-4]))

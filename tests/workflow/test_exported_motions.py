@@ -80,19 +80,24 @@ def shown(file):
             entry["count"], -1
         )
 
-    (primitive,) = content["meshes"][0]["primitives"]
-    targets = np.stack([array(target["POSITION"]) for target in primitive["targets"]])
+    primitives = [primitive for mesh in content["meshes"] for primitive in mesh["primitives"]]
+    first = np.concatenate([array(each["attributes"]["POSITION"]) for each in primitives])
+    moves = [[array(target["POSITION"]) for target in each["targets"]] for each in primitives]
+    targets = np.concatenate([np.stack(each) for each in moves], axis=1)
     sampler = content["animations"][0]["samplers"][0]
     time = array(sampler["input"])[:, 0]
     weights = array(sampler["output"]).reshape(len(time), -1)
-    return array(primitive["attributes"]["POSITION"]) + np.einsum("tk,knc->tnc", weights, targets), time
+    return first + np.einsum("tk,knc->tnc", weights, targets), time
 
 
 def test_surface_as_gltf(moved):
     folder, bodies, x, time = moved
     vertices, at = shown(folder / "surface.glb")
     np.testing.assert_allclose(at, time, rtol=1e-6)
-    (mesh,) = trimesh.load(folder / "surface.glb", process=False).geometry.values()
+    meshes = trimesh.load(folder / "surface.glb", process=False).geometry.values()
+    mesh = trimesh.util.concatenate(
+        [trimesh.Trimesh(each.vertices, each.faces, process=False) for each in meshes]
+    )
     np.testing.assert_array_equal(mesh.vertices, vertices[0])
     parts = trimesh.graph.connected_components(mesh.face_adjacency, min_len=100)
     assert len(parts) == bodies

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from neuma_lib.coupling.markers import MarkerTracks
-from neuma_lib.io.markers import write_markers
+from tests.support.markers import write_markers
 from tests.support.project import copied, overlay
 
 LAW = {

@@ -45,6 +45,7 @@ rule export_surface:
     input:
         **MOVED,
         mesh=of_replicate("mesh.ply"),
+        velocity=of_replicate("velocity.json"),
         obstacles=obstacle_meshes,
     output:
         surface=f"{EXPORT}/surface.{{kind}}",

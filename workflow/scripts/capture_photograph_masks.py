@@ -68,7 +68,8 @@ def main(inputs, output, params, run) -> None:
                 *_points(poses, names, inputs.room),
                 network,
                 params.name,
-                0.0 if board else None,  # a fitted floor may be a bed
+                0.0,
+                board is None,  # a fitted floor may be a bed
                 run.progress,
             )
     for k, (frame, name) in enumerate(zip(frames, names)):

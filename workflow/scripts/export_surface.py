@@ -4,6 +4,7 @@ from pathlib import Path
 
 from neuma_lib.geometry.moving_surface import moving_surface, vertex_colours
 from neuma_lib.geometry.obstacles import obstacles
+from neuma_lib.io.files import read_json
 from neuma_lib.io.gaussians import load_gaussians
 from neuma_lib.io.gltf import write_glb
 from neuma_lib.io.hdf5 import read_arrays
@@ -17,11 +18,15 @@ def main(inputs, output, params, run) -> None:
     path, attributes = read_arrays(inputs.rollout, required=("x", "frames"), only=("x", "frames"))
     mesh = read_mesh(inputs.mesh)
     vertices = moving_surface(mesh, path["x"])
-    write = write_glb if Path(output.surface).suffix == ".glb" else write_usd
     colours = vertex_colours(mesh, load_gaussians(inputs.gaussians))
     times = path["frames"] * attributes["dt"]
     around = obstacles(with_obstacles(params.obstacles).get("colliders", ()), times)
-    write(output.surface, vertices, mesh.faces, times, colours, around)
+    surface = (output.surface, vertices, mesh.faces, times, colours, around)
+    if Path(output.surface).suffix == ".glb":
+        bodies = read_json(inputs.velocity).get("bodies", ())
+        write_glb(*surface, [(body.get("name", body["scene"]), body["vertices"]) for body in bodies])
+    else:
+        write_usd(*surface)
     run.log(f"{vertices.shape[0]} frames of {vertices.shape[1]} vertices")
 
 

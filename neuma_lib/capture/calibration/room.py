@@ -25,7 +25,7 @@ from neuma_lib.capture.calibration.placement import (
 )
 from neuma_lib.capture.calibration.poses import Poses, find_boards
 from neuma_lib.capture.calibration.vertical import MAX_ANGLE, UP, Cue, camera_cues, check_vertical
-from neuma_lib.capture.masks.selection import box_in, locate
+from neuma_lib.capture.masks.selection import Box, box_in, locate
 from neuma_lib.capture.pictures import (
     group_of,
     orientation_of,
@@ -143,14 +143,24 @@ def room_of(
         np.median(np.linalg.norm(poses.points - centres.mean(axis=0), axis=1)) if len(poses.points) else 0.0
     )
     level = [cues[0].up, MAX_ANGLE + 2 * cues[0].deviation] if cues else []
-    points, above, middle = poses.points, centres, np.median(poses.points, axis=0)
-    if settings.object and (found := _object(poses, settings, orientations or {})):
-        middle, size = found
-        near = np.linalg.norm(points - middle, axis=1) < _SUPPORT * size
-        if near.sum() >= _MIN_SUPPORT:
-            points, above = points[near], np.concatenate([centres, middle[None]])
+    middle, boxed = np.median(poses.points, axis=0), _boxed(poses, settings, orientations or {})
+    regions = [(poses.points, centres, away)]
+    if (located := locate(*boxed)) is not None:
+        middle, size = located
+        points = poses.points[np.linalg.norm(poses.points - middle, axis=1) < _SUPPORT * size]
+        if len(points) >= _MIN_SUPPORT:
             away = np.median(np.linalg.norm(centres - middle, axis=1))
-    point, normal, share = fit_floor(points, above, FLOOR_TOLERANCE * away, settings.seed, *level)
+            regions.insert(0, (points, np.concatenate([centres, middle[None]]), away))
+    for k, (points, above, away) in enumerate(regions, 1):
+        try:
+            point, normal, share = fit_floor(points, above, FLOOR_TOLERANCE * away, settings.seed, *level)
+        except InputError:  # the points in the box may be those of the floor behind the object
+            if k == len(regions):
+                raise
+        else:
+            break
+    if (located := locate(*boxed, (point, normal))) is not None:
+        middle = located[0]
     level = upright(normal, middle - ((middle - point) @ normal) * normal)
     if settings.length is None:
         scale, source = 1 / max(away, 1e-12), None
@@ -160,19 +170,17 @@ def room_of(
     return Room(poses.moved(room), room, floor=share, scale=source)
 
 
-def _object(
+def _boxed(
     poses: Poses, settings: CaptureConfig, orientations: Mapping[str, int | None]
-) -> tuple[np.ndarray, float] | None:
-    """Centre (3,) and half size of the selected object. None if its photographs have no poses."""
+) -> tuple[np.ndarray, np.ndarray, dict[int, Box], np.ndarray, np.ndarray]:
+    """Arguments of `locate`: cameras, boxes of the object in photographs with poses, and points."""
     boxes, Ks = {}, np.stack([lens.pinhole().K for lens in poses.lenses])
     for file, rectangle in settings.object.items():
         name = picture_name(PHOTOGRAPHS, file)
         if name in poses.names:
             i = poses.names.index(name)
             boxes[i] = box_in(rectangle, orientations.get(name), poses.lenses[i], Ks[i])
-    if not boxes:
-        return None
-    return locate(poses.viewmats, Ks, boxes, poses.points, poses.seen(poses.names), "object")
+    return poses.viewmats, Ks, boxes, poses.points, poses.seen(poses.names)
 
 
 def _metres_per_unit(

@@ -28,7 +28,8 @@ from scipy import ndimage
 
 from neuma_lib.capture.calibration.lens import Lens
 from neuma_lib.capture.calibration.placement import camera_centres
-from neuma_lib.capture.masks.agreement import nearest_point, projected
+from neuma_lib.capture.calibration.vertical import UP
+from neuma_lib.capture.masks.agreement import projected
 from neuma_lib.capture.masks.mask_refinement import colour_bins, colour_shares, log_ratio
 from neuma_lib.capture.masks.regions import component, grabcut, grown, radius_of, shrunk
 from neuma_lib.capture.masks.silhouettes import UNSEEN, cheapest
@@ -40,6 +41,7 @@ MIN_FILLED = 0.8
 """Share of the width and of the height of a box that the selected object must fill."""
 _MIN_POINTS = 3  # points of the reconstruction that locate a box in depth
 _MIDDLE = 0.6  # part of a box in which they are, its border often shows what is behind
+_ON_FLOOR = 0.15  # height up to which a point may be one of the floor, in half boxes
 _DEPTH = 0.3  # distance from the surface of the object to its centre, in half boxes
 _REACH = 1.4  # half side of the cube of voxels, in half boxes
 _VOXELS = 56  # along a side of the cube
@@ -150,7 +152,8 @@ def selected_masks(
     seen: np.ndarray,
     saliency: Callable[[np.ndarray], np.ndarray],
     name: str,
-    floor: float | None = None,
+    floor: float,
+    sunk: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[np.ndarray]:
     """Masks of the object in a box in all N >= 2 photographs. Empty where a photograph does not show it.
@@ -164,7 +167,8 @@ def selected_masks(
         seen: which points each photograph shows, Boolean, (N, P).
         saliency: `neuma_lib.capture.masks.saliency.Saliency`, or another function that returns (H, W) in [0, 1].
         name: of the capture for messages.
-        floor: height y below which there is no object. None: unknown.
+        floor: height y of the plane on which the object rests.
+        sunk: whether parts of it may lie lower, as on a bed.
         progress: called with the numbers of finished and of all steps.
 
     Raises:
@@ -173,9 +177,9 @@ def selected_masks(
     chosen = {}
     for i, box in boxes.items():
         if box.guessed:
-            box = _fitted(i, box, pictures, viewmats, Ks, points, seen, saliency, name, floor)
+            box = _fitted(i, box, pictures, viewmats, Ks, points, seen, saliency, name, floor, sunk)
         chosen[i] = box
-    masks = _masks(pictures, viewmats, Ks, chosen, points, seen, saliency, name, floor, progress)
+    masks = _masks(pictures, viewmats, Ks, chosen, points, seen, saliency, name, floor, sunk, progress)
     for i, box in chosen.items():
         _check_filled(masks[i], box, f"{name}, photograph {i + 1}")
     return masks
@@ -191,7 +195,8 @@ def _fitted(
     seen: np.ndarray,
     saliency: Callable[[np.ndarray], np.ndarray],
     name: str,
-    floor: float | None,
+    floor: float,
+    sunk: bool,
 ) -> Box:
     """The box around the object at the middle of a guessed one. Arguments are those of `selected_masks`."""
     others = [i for i in range(len(pictures)) if i != number]
@@ -200,7 +205,7 @@ def _fitted(
     size = np.array(pictures[number].shape[1::-1], float)
     for _ in range(_POINT_ROUNDS):
         box = Box(np.clip(box.lower, 0, size), np.clip(box.upper, 0, size))
-        mask = _masks(some, views, intrinsics, {0: box}, points, seen[used], saliency, name, floor)[0]
+        mask = _masks(some, views, intrinsics, {0: box}, points, seen[used], saliency, name, floor, sunk)[0]
         rows, columns = np.nonzero(mask)
         if not len(rows):
             break
@@ -222,16 +227,24 @@ def _masks(
     seen: np.ndarray,
     saliency: Callable[[np.ndarray], np.ndarray],
     name: str,
-    floor: float | None = None,
+    floor: float,
+    sunk: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[np.ndarray]:
     """Masks of `selected_masks`, from boxes only, which they need not fill."""
-    centre, size = locate(viewmats, Ks, boxes, points, seen, name)
+    located = locate(viewmats, Ks, boxes, points, seen, (np.array([0, floor, 0.0]), np.array(UP)))
+    if located is None:
+        raise InputError(
+            name,
+            "neither points of the reconstruction nor the floor determine the distance of the object in the box",
+            "Draw the box in a photograph that looks down at the object",
+        )
+    centre, size = located
     half = _REACH * size
     ticks = ((np.arange(_VOXELS) + 0.5) / _VOXELS * 2 - 1) * half
     voxels = np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), axis=-1).reshape(-1, 3) + centre
     voxel = 2 * half / _VOXELS
-    allowed = np.ones(len(voxels), bool) if floor is None else voxels[:, 1] > floor
+    allowed = np.ones(len(voxels), bool) if sunk else voxels[:, 1] > floor
     for i, box in boxes.items():
         pixels, depth = projected(voxels, viewmats[i], Ks[i])
         allowed &= (depth > 0) & ((pixels >= box.lower) & (pixels <= box.upper)).all(axis=1)
@@ -264,41 +277,41 @@ def locate(
     boxes: Mapping[int, Box],
     points: np.ndarray,
     seen: np.ndarray,
-    name: str,
-) -> tuple[np.ndarray, float]:
-    """Centre (3,) of the object, and half of the longer side of its box, from the points that a boxed photograph shows.
+    floor: tuple[np.ndarray, np.ndarray] | None = None,
+) -> tuple[np.ndarray, float] | None:
+    """Centre (3,) of the object, and half of the longer side of its box.
 
-    An object without texture has too few points. Several boxes then triangulate it. Arguments are those of
-    `selected_masks`.
+    The points that a boxed photograph shows give its distance. If those above the floor are too few, as on an object
+    without texture, the object is a ball in its box that touches the floor.
 
-    Raises:
-        InputError: there are neither enough points nor two boxes.
+    Args:
+        viewmats, Ks, boxes, points, seen: as those of `selected_masks`.
+        floor: a point of the plane under the object (3,), and its unit normal (3,). None: unknown.
+
+    Returns:
+        None if neither points nor the floor determine the distance.
     """
-    centres, sizes, eyes, rays = [], [], camera_centres(viewmats), []
+    centres, sizes, eyes = [], [], camera_centres(viewmats)
     for i, box in boxes.items():
         pixels, depth = projected(points, viewmats[i], Ks[i])
         inside = seen[i] & (depth > 0) & (np.abs((pixels - box.middle) / box.half) < _MIDDLE).all(axis=1)
         focal = Ks[i][[0, 1], [0, 1]]
-        ray = viewmats[i][:3, :3].T @ np.append((box.middle - Ks[i][:2, 2]) / focal, 1.0)
-        rays.append(ray)
+        half, middle = box.half / focal, (box.middle - Ks[i][:2, 2]) / focal
+        ray, resting = viewmats[i][:3, :3].T @ np.append(middle, 1.0), np.nan
+        if floor is not None:
+            above = viewmats[i][:3, :3] @ floor[1]
+            up = above[:2] - middle * above[2]  # in the picture
+            radius = np.linalg.norm(half * up / np.linalg.norm(up))
+            resting = (eyes[i] - floor[0]) @ floor[1] / max(radius - ray @ floor[1], 1e-9)
+            inside &= (points - floor[0]) @ floor[1] > _ON_FLOOR * resting * half.max()
         if inside.sum() >= _MIN_POINTS:
             near = float(np.median(depth[inside]))
-            sizes.append(near * float((box.half / focal).max()))
+            sizes.append(near * float(half.max()))
             centres.append(eyes[i] + (near + _DEPTH * sizes[-1]) * ray)
-    if centres:
-        return np.mean(centres, axis=0), float(np.mean(sizes))
-    if len(boxes) < 2:
-        raise InputError(
-            name,
-            "the reconstruction has too few points in the middle of the box, so its distance is unknown",
-            "Give boxes in two or more photographs from different sides (`object` in capture.yaml)",
-        )
-    numbers = list(boxes)
-    middles = np.stack([box.middle for box in boxes.values()])
-    centre = nearest_point(middles, viewmats[numbers], Ks[numbers])
-    depths = (viewmats[numbers, 2, :3] @ centre) + viewmats[numbers, 2, 3]
-    halves = [(box.half / K[[0, 1], [0, 1]]).max() for box, K in zip(boxes.values(), Ks[numbers])]
-    return centre, float(np.mean(depths * halves))
+        elif resting > 0:
+            sizes.append(float(resting * half.max()))
+            centres.append(eyes[i] + resting * ray)
+    return (np.mean(centres, axis=0), float(np.mean(sizes))) if centres else None
 
 
 def _view(

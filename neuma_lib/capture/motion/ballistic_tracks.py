@@ -1,8 +1,9 @@
 """Detect ballistic tracks among the moving regions of one camera.
 
 A hand that launches an object is often larger than the object and moves too. In free flight the position in the picture
-is nearly a quadratic function of time. Hands, noise and shadows follow a parabola only briefly. A track starts from
-three candidates at equal spacings and grows in both directions while candidates lie on it.
+is nearly a quadratic function of time. Hands, noise and shadows follow a parabola only briefly. What rolls through the
+background follows a line. A track starts from three candidates at equal spacings and grows in both directions while
+candidates lie on it.
 
 Positions are (x, y) [px], pixel centres at +0.5.
 """
@@ -22,6 +23,7 @@ _TOLERANCE = 0.35  # distance from the track, in radii
 _MIN_TOLERANCE = 2.0  # [px]
 _MAX_AREA_RATIO = 2.5  # within a track; motion blur changes areas
 _SPACINGS = (1, 2, 4, 8, 16)  # frames between the three candidates that start a track
+_MIN_DEPTH = 0.5  # of the curve of a track, as share of that of another one, with which both may be flights
 _MAX_GAP = 2  # frames in which the object may be missed
 
 
@@ -59,6 +61,9 @@ def find_ballistic_tracks(
 ) -> list[BallisticTrack]:
     """Tracks in order of time, without shared frames. The longest ones are selected first.
 
+    What rolls or is carried moves along a line, possibly longer than the object flies. So a track of which the curve is
+    less than half as deep gives way, and so does one with less than half of the acceleration of the first.
+
     Args:
         candidates: x, y and area of moving regions that do not touch the picture's border, (N, 3) for each of T frames.
         times: [s], ascending, (T,).
@@ -73,6 +78,8 @@ def find_ballistic_tracks(
         row[: len(largest)] = regions[largest]
     tracks: list[BallisticTrack] = []
     while (best := _longest(table, times, down)) is not None:
+        if tracks and _depth(best) < _MIN_DEPTH * _depth(tracks[0]):
+            break
         first, last = best.frames
         table[first : last + 1] = np.nan
         tracks.append(replace(best, candidates={i: int(order[i][c]) for i, c in best.candidates.items()}))
@@ -80,6 +87,12 @@ def find_ballistic_tracks(
 
 
 def _longest(table: np.ndarray, times: np.ndarray, down: np.ndarray | None) -> BallisticTrack | None:
+    def better(track: BallisticTrack, other: BallisticTrack) -> bool:
+        depth, least = (_depth(each, np.ptp(times[list(each.frames)])) for each in (track, other))
+        if min(depth, least) < _MIN_DEPTH * max(depth, least):
+            return depth > least
+        return len(track.candidates) > len(other.candidates)
+
     best: BallisticTrack | None = None
     for spacing in _SPACINGS:
         for middle in range(spacing, len(times) - spacing):
@@ -90,9 +103,14 @@ def _longest(table: np.ndarray, times: np.ndarray, down: np.ndarray | None) -> B
                 track = _grown(table, times, three, chosen)
                 if track is not None and down is not None and track.coefficients[2] @ down <= 0:
                     continue
-                if track is not None and (best is None or len(track.candidates) > len(best.candidates)):
+                if track is not None and (best is None or better(track, best)):
                     best = track
     return best
+
+
+def _depth(track: BallisticTrack, duration: float = 2.0) -> float:
+    """Distance of the middle of a part of this duration [s] from the line through its ends [px]."""
+    return float(np.linalg.norm(track.coefficients[2])) * (duration / 2) ** 2
 
 
 def _grown(

@@ -75,14 +75,13 @@ class ColourNetwork(nn.Module):
     Args:
         features: number of features of a point.
         width: width of the hidden layers.
-        frequencies: number of powers 2^k of the positional encoding of the direction.
     """
 
-    def __init__(self, features: int = FEATURES, width: int = 128, frequencies: int = 4):
+    def __init__(self, features: int = FEATURES, width: int = 128):
         super().__init__()
-        self.register_buffer("frequencies", 2.0 ** torch.arange(frequencies), persistent=False)
+        self.register_buffer("frequencies", 2.0 ** torch.arange(4), persistent=False)
         self.layers = nn.Sequential(
-            nn.Linear(features + 3 + 6 * frequencies, width), nn.ReLU(),
+            nn.Linear(features + 3 + 6 * 4, width), nn.ReLU(),
             nn.Linear(width, width), nn.ReLU(),
             nn.Linear(width, 3),
         )  # fmt: skip
