@@ -53,7 +53,7 @@ def test_surface_of_six_bodies(bodies, name):
 
 
 def test_bodies_of_labelled_images_have_their_volumes(tmp_path):
-    """Two balls of 22 px. Without the pixels that they cover by less than half, volumes would be 5 % too small."""
+    """Two balls of 22 px. Without the pixels that they cover by less than half, volumes would be 6 % too small."""
     balls = [trimesh.creation.icosphere(4, 0.1).apply_translation((x, 0.5, 0.5)) for x in (0.35, 0.65)]
     cameras = cameras_around(trimesh.util.concatenate(balls), views=40, size=64)
     alphas = torch.stack([mattes(each, cameras)[..., 3] for each in balls])
