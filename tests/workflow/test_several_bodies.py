@@ -52,6 +52,14 @@ def test_bodies_are_scenes_that_are_identified_together(project):
         assert identified not in evaluated[metrics]
 
 
+def test_bodies_together_and_one_alone_share_the_cores(project):
+    """The plan has two cores."""
+    plan = project.plan(
+        *CHANGES, *(f"{RESULTS}/{name}/identified.json" for name in ("Pile", f"Pile_{NAMES[0]}"))
+    )
+    assert all("threads: 2" not in plan.one(rule).text for rule in ("identify", "identify_bodies"))
+
+
 def test_a_pile_has_no_fit_of_one_law(project):
     refused = project.run("--dry-run", *CHANGES, f"{RESULTS}/Pile/neuma/adaptor.safetensors", succeeds=False)
     assert "Pile_fish, Pile_duck, Pile_ball" in refused and "Traceback (most recent call last)" not in refused

@@ -281,7 +281,8 @@ def identify_threads(wildcards):
     """
     if GPU or not (workflow.is_main_process and workflow.local_exec):
         return 1
-    jobs = sum(job.rule.name in ("identify", "identify_views") for job in workflow.dag.needrun_jobs())
+    rules = ("identify", "identify_views", "identify_bodies", "next")
+    jobs = sum(job.rule.name in rules for job in workflow.dag.needrun_jobs())
     return max(1, workflow.cores // max(1, jobs))
 
 
