@@ -76,6 +76,16 @@ def test_without_points_on_the_object_the_floor_locates_it(room):
         assert np.mean([iou(a, b) for a, b in zip(masks, room.masks)]) > 0.9
 
 
+def test_a_fitted_floor_does_not_cut_what_sank_into_a_bed(room):
+    """Points near the object that are below the floor show that it is a bed. Without them its part there is cut off."""
+    first = largest(room)
+    high, box = 0.1, {first: box_around(room.masks[first])}
+    assert np.mean([iou(a, b) for a, b in zip(select(room, box, floor=high), room.masks)]) > GOAL
+    above = room.points[:, 1] > high
+    with refused("capture"):
+        select(room, box, floor=high, points=room.points[above], seen=room.seen[:, above])
+
+
 def test_a_ball_on_the_floor_is_located_by_its_box():
     """Exact up to the perspective of a ball, (radius / distance)^2 = 0.6 %, in a camera that is turned at random."""
     rng = np.random.default_rng(0)

@@ -69,7 +69,6 @@ def main(inputs, output, params, run) -> None:
                 network,
                 params.name,
                 0.0,
-                board is None,  # a fitted floor may be a bed
                 run.progress,
             )
     for k, (frame, name) in enumerate(zip(frames, names)):

@@ -43,6 +43,7 @@ _MIN_POINTS = 3  # points of the reconstruction that locate a box in depth
 _MIDDLE = 0.6  # part of a box in which they are, its border often shows what is behind
 _ON_FLOOR = 0.15  # height up to which a point may be one of the floor, in half boxes
 _DEPTH = 0.3  # distance from the surface of the object to its centre, in half boxes
+_SUNK = 0.05  # share of the points near the object that are below the floor if it is none, but a bed
 _REACH = 1.4  # half side of the cube of voxels, in half boxes
 _VOXELS = 56  # along a side of the cube
 _SIDE = 224  # longer side of the part of a photograph that shows the cube [px]
@@ -153,7 +154,6 @@ def selected_masks(
     saliency: Callable[[np.ndarray], np.ndarray],
     name: str,
     floor: float,
-    sunk: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[np.ndarray]:
     """Masks of the object in a box in all N >= 2 photographs. Empty where a photograph does not show it.
@@ -167,8 +167,8 @@ def selected_masks(
         seen: which points each photograph shows, Boolean, (N, P).
         saliency: `neuma_lib.capture.masks.saliency.Saliency`, or another function that returns (H, W) in [0, 1].
         name: of the capture for messages.
-        floor: height y of the plane on which the object rests.
-        sunk: whether parts of it may lie lower, as on a bed.
+        floor: height y of the plane on which the object rests. If points near it are lower, as on a bed, it may
+            be lower too.
         progress: called with the numbers of finished and of all steps.
 
     Raises:
@@ -177,9 +177,9 @@ def selected_masks(
     chosen = {}
     for i, box in boxes.items():
         if box.guessed:
-            box = _fitted(i, box, pictures, viewmats, Ks, points, seen, saliency, name, floor, sunk)
+            box = _fitted(i, box, pictures, viewmats, Ks, points, seen, saliency, name, floor)
         chosen[i] = box
-    masks = _masks(pictures, viewmats, Ks, chosen, points, seen, saliency, name, floor, sunk, progress)
+    masks = _masks(pictures, viewmats, Ks, chosen, points, seen, saliency, name, floor, progress)
     for i, box in chosen.items():
         _check_filled(masks[i], box, f"{name}, photograph {i + 1}")
     return masks
@@ -196,7 +196,6 @@ def _fitted(
     saliency: Callable[[np.ndarray], np.ndarray],
     name: str,
     floor: float,
-    sunk: bool,
 ) -> Box:
     """The box around the object at the middle of a guessed one. Arguments are those of `selected_masks`."""
     others = [i for i in range(len(pictures)) if i != number]
@@ -205,7 +204,7 @@ def _fitted(
     size = np.array(pictures[number].shape[1::-1], float)
     for _ in range(_POINT_ROUNDS):
         box = Box(np.clip(box.lower, 0, size), np.clip(box.upper, 0, size))
-        mask = _masks(some, views, intrinsics, {0: box}, points, seen[used], saliency, name, floor, sunk)[0]
+        mask = _masks(some, views, intrinsics, {0: box}, points, seen[used], saliency, name, floor)[0]
         rows, columns = np.nonzero(mask)
         if not len(rows):
             break
@@ -228,7 +227,6 @@ def _masks(
     saliency: Callable[[np.ndarray], np.ndarray],
     name: str,
     floor: float,
-    sunk: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[np.ndarray]:
     """Masks of `selected_masks`, from boxes only, which they need not fill."""
@@ -244,6 +242,8 @@ def _masks(
     ticks = ((np.arange(_VOXELS) + 0.5) / _VOXELS * 2 - 1) * half
     voxels = np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), axis=-1).reshape(-1, 3) + centre
     voxel = 2 * half / _VOXELS
+    heights = points[np.hypot(*(points - centre)[:, [0, 2]].T) < size, 1]
+    sunk = len(heights) > 0 and np.quantile(heights, _SUNK) < floor - voxel / 2
     allowed = np.ones(len(voxels), bool) if sunk else voxels[:, 1] > floor
     for i, box in boxes.items():
         pixels, depth = projected(voxels, viewmats[i], Ks[i])
