@@ -86,6 +86,23 @@ def test_a_fitted_floor_does_not_cut_what_sank_into_a_bed(room):
         select(room, box, floor=high, points=room.points[above], seen=room.seen[:, above])
 
 
+def test_the_shadow_of_the_object_is_one_of_its_surroundings():
+    """A floor at 0.3 of its brightness is no object, although no photograph shows a floor of this colour elsewhere."""
+    rng = np.random.default_rng(0)
+    floor, body = rng.normal((180, 150, 110), 12, (5000, 3)), rng.normal((60, 140, 70), 12, (2000, 3))
+    shadow = 0.3 * floor[:500]
+    object_ = module.colour_shares(
+        np.concatenate([body, shadow[:200]])
+    )  # of a silhouette with some shadow in it
+    ratios = [
+        module.log_ratio(object_, around)[module.colour_bins(shadow)].mean()
+        for around in (module.colour_shares(floor), module._shaded_shares(floor))
+    ]
+    assert ratios[0] > 2 and ratios[1] < 0.5 * ratios[0]
+    kept = module.log_ratio(object_, module._shaded_shares(floor))[module.colour_bins(body)]
+    assert np.median(kept) > 2
+
+
 def test_a_ball_on_the_floor_is_located_by_its_box():
     """Exact up to the perspective of a ball, (radius / distance)^2 = 0.6 %, in a camera that is turned at random."""
     rng = np.random.default_rng(0)

@@ -5,8 +5,8 @@ object collects evidence (compare Campbell et al. 2010 and Kolev et al. 2009):
 
 - It is not the object if it projects outside a box, lies below the floor, or lies between a camera and a point of the
   reconstruction that this camera sees.
-- The colour of its pixel in each photograph is that of the object, or of the surroundings in this photograph. GrabCut
-  in the box is the first estimate. Then colours and voxels are estimated in turn.
+- The colour of its pixel in each photograph is that of the object, or of the surroundings in this photograph, which
+  the object's shadow darkens. GrabCut in the box is the first estimate. Then colours and voxels are estimated in turn.
 - A network for salient objects sees only the part of each photograph that shows the voxels.
 
 The mean over the photographs and over neighbouring voxels decides. One photograph against the object counts more than
@@ -57,6 +57,8 @@ _CERTAIN, _EDGE = 0.06, 0.1  # distance from the silhouette of certain pixels an
 _TRIMMED = 0.15  # share of the photographs that does not count for a colour
 _AWAY, _MIN_AROUND = 1.15, 200  # distance in half boxes, and number, of pixels that show the surroundings
 _STIFF = 8.0  # cost of an edge at the limit of this distance
+_SHADED = 0.1  # share of the surroundings that is in the object's shadow
+_SHADES = (0.25, 0.4, 0.6, 0.8)  # brightness there, relative to that without shadow
 _OCCLUDED = -2.5  # log-likelihood ratio of the colours of something in front of the object
 
 
@@ -365,7 +367,7 @@ def _learn_from_boxes(
             own.append(view.pixels[shrunk(mask, 2)])
             around.append(view.pixels[~inside])
             view.colour = np.where(mask, _MAX_COLOUR, -_MAX_COLOUR)
-    object_, surroundings = colour_shares(np.concatenate(own)), colour_shares(np.concatenate(around))
+    object_, surroundings = colour_shares(np.concatenate(own)), _shaded_shares(np.concatenate(around))
     for view in views:
         if view.number not in boxes:
             place, depth = projected(centre[None], viewmats[view.number], view.K)
@@ -373,7 +375,7 @@ def _learn_from_boxes(
             away = np.hypot(x - place[0, 0], y - place[0, 1]) > _AWAY * size * view.K[0, 0] / max(
                 depth[0], 1e-9
             )
-            nearby = colour_shares(view.pixels[away]) if away.sum() > _MIN_AROUND else surroundings
+            nearby = _shaded_shares(view.pixels[away]) if away.sum() > _MIN_AROUND else surroundings
             view.colour = _evidence(view.pixels, object_, (nearby + surroundings) / 2)
 
 
@@ -391,9 +393,15 @@ def _learn(views: Sequence[_View], silhouettes: Sequence[np.ndarray]) -> None:
     counted = max(1, round((1 - _TRIMMED) * len(views)))
     object_ = np.sort(inner, axis=0)[:counted].mean(axis=0)
     object_ /= max(object_.sum(), 1e-9)
-    around = colour_shares(np.concatenate(outer))
+    around = _shaded_shares(np.concatenate(outer))
     for view, pixels in zip(views, outer):
-        view.colour = _evidence(view.pixels, object_, (colour_shares(pixels) + around) / 2)
+        view.colour = _evidence(view.pixels, object_, (_shaded_shares(pixels) + around) / 2)
+
+
+def _shaded_shares(pixels: np.ndarray) -> np.ndarray:
+    """`colour_shares` of surroundings, of which the object's shadow darkens a part that varies between photographs."""
+    shaded = [colour_shares(pixels * shade) for shade in _SHADES]
+    return (1 - _SHADED) * colour_shares(pixels) + _SHADED * np.mean(shaded, axis=0)
 
 
 def _evidence(pixels: np.ndarray, object_: np.ndarray, around: np.ndarray) -> np.ndarray:
