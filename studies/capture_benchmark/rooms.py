@@ -29,7 +29,7 @@ from neuma_lib.config.validation import validate
 from neuma_lib.evaluation.text_tables import as_markdown
 from neuma_lib.io.files import read_json, write_json, write_text
 from neuma_lib.io.images import read_transforms
-from neuma_lib.paper.identified_table import compare_family, compare_quantities
+from neuma_lib.paper.identified_table import FITS, MATERIAL, compare_family, compare_quantities
 from neuma_lib.project.loading import read_yaml
 from studies.capture_benchmark.evaluation import (
     compare_cameras,
@@ -148,7 +148,7 @@ def compare(demo: DemoCapturesConfig, name: str, settings: Mapping[str, Any]) ->
     for path in scene.glob("identified*.json"):
         identified = read_json(path)
         row["family"] = f"{identified['family']} ({compare_family(identified, known['law'])})"
-        row["quantities"] = compare_quantities(identified, known["law"])
+        row["quantities"] = {of: compare_quantities(identified, known["law"], of) for of in FITS}
     return row
 
 
@@ -158,7 +158,7 @@ def table(demo: DemoCapturesConfig, rows: Mapping[str, Mapping[str, Any]]) -> st
     heads += ["gravity, placed", "family", "determined", "in 2 std", "core s"]
     cells = []
     for name, row in rows.items():
-        sure = [q for q in row.get("quantities", []) if q["determined"]]
+        sure = [q for q in row.get("quantities", {}).get(MATERIAL, []) if q["determined"]]
         gravity = row.get("gravity_placed") or row.get("gravity_flight")
         cells.append(
             [
