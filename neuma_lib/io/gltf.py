@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -55,11 +55,9 @@ def write_glb(
         accessors.append(entry)
         return len(accessors) - 1
 
-    colors, first, meshes = linear(colors).astype("<f4"), 0, []
-    for name, count in bodies or [("body", vertices.shape[1])]:
-        own = slice(first, first + count)
-        faces_of = np.asarray(faces)[(faces[:, 0] >= own.start) & (faces[:, 0] < own.stop)] - first
-        part, first = vertices[:, own], own.stop
+    colors, meshes = linear(colors).astype("<f4"), []
+    for name, own, faces_of in parts_of(faces, bodies or [("body", vertices.shape[1])]):
+        part = vertices[:, own]
         indices = add(np.asarray(faces_of, "<u4").ravel(), "SCALAR", _FACES)
         attributes = {"POSITION": add(part[0], "VEC3", _VERTICES, bounds=True)}
         attributes["COLOR_0"] = add(colors[own], "VEC3", _VERTICES)
@@ -121,6 +119,15 @@ def write_glb(
         parts = (headers[0], text, headers[1], body)
         size = 12 + sum(map(len, parts))
         partial.write_bytes(struct.pack("<4sII", b"glTF", 2, size) + b"".join(map(bytes, parts)))
+
+
+def parts_of(faces: np.ndarray, bodies: Sequence[tuple[str, int]]) -> Iterator[tuple[str, slice, np.ndarray]]:
+    """Name, vertices and faces (M_k, 3) of each body of a surface, the latter with numbers of its own vertices."""
+    first, faces = 0, np.asarray(faces)
+    for name, count in bodies:
+        own = slice(first, first + count)
+        yield name, own, faces[(faces[:, 0] >= own.start) & (faces[:, 0] < own.stop)] - first
+        first = own.stop
 
 
 def linear(srgb: ArrayLike) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 from neuma_lib.extras import require
 from neuma_lib.geometry.obstacles import Obstacle
 from neuma_lib.io.files import atomic
-from neuma_lib.io.gltf import linear
+from neuma_lib.io.gltf import linear, parts_of
 
 CODES_A_SECOND = 24.0
 """USD time codes per second; frames may have fractional codes."""
@@ -23,13 +23,18 @@ def write_usd(
     times: np.ndarray,
     colors: np.ndarray,
     obstacles: Sequence[Obstacle] = (),
+    bodies: Sequence[tuple[str, int]] = (),
 ) -> None:
     """Write a moving surface, y up, in metres; arguments as for `write_glb`. The suffix sets the format: usda, usdc.
+
+    Characters of names that USD does not allow become underscores.
 
     Raises:
         InputError: usd-core is missing.
     """
-    Gf, Usd, UsdGeom, Vt = (require(f"pxr.{name}", "viewer") for name in ("Gf", "Usd", "UsdGeom", "Vt"))
+    Gf, Tf, Usd, UsdGeom, Vt = (
+        require(f"pxr.{name}", "viewer") for name in ("Gf", "Tf", "Usd", "UsdGeom", "Vt")
+    )
     codes = np.asarray(times, np.float64) * CODES_A_SECOND
     with atomic(path) as partial:
         partial.unlink(missing_ok=True)
@@ -51,14 +56,15 @@ def write_usd(
             mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.asarray(triangles, np.int32).ravel()))
             return mesh
 
-        mesh = define("surface", faces)
-        points, extent = mesh.CreatePointsAttr(), mesh.CreateExtentAttr()
-        for code, frame in zip(codes, np.ascontiguousarray(vertices, np.float32), strict=True):
-            points.Set(Vt.Vec3fArray.FromNumpy(frame), float(code))
-            ends = [Gf.Vec3f(*end.tolist()) for end in (frame.min(axis=0), frame.max(axis=0))]
-            extent.Set(Vt.Vec3fArray(ends), float(code))
-        display_color = mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
-        display_color.Set(Vt.Vec3fArray.FromNumpy(linear(colors).astype(np.float32)))
+        for name, own, faces_of in parts_of(faces, bodies or [("surface", vertices.shape[1])]):
+            mesh = define(Tf.MakeValidIdentifier(name), faces_of)
+            points, extent = mesh.CreatePointsAttr(), mesh.CreateExtentAttr()
+            for code, frame in zip(codes, np.ascontiguousarray(vertices[:, own], np.float32), strict=True):
+                points.Set(Vt.Vec3fArray.FromNumpy(frame), float(code))
+                ends = [Gf.Vec3f(*end.tolist()) for end in (frame.min(axis=0), frame.max(axis=0))]
+                extent.Set(Vt.Vec3fArray(ends), float(code))
+            display_color = mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
+            display_color.Set(Vt.Vec3fArray.FromNumpy(linear(colors[own]).astype(np.float32)))
         for k, obstacle in enumerate(obstacles, 1):
             mesh = define(f"obstacle_{k}", obstacle.faces)
             corners = np.ascontiguousarray(obstacle.vertices, np.float32)

@@ -17,8 +17,8 @@ from neuma_lib.paper.identified_table import WRONG, compare_family, compare_quan
 CLOSE = 15.0
 """Maximum error of a determined constant that counts as right [%]."""
 SLIDES = 0.1
-"""Maximum error of a friction that counts as right, and largest standard deviation of one that is compared, since a
-contact that does not slide does not show it."""
+"""Maximum error of a friction that counts as right. It is compared if half the distance to the upper end of its band of
+two standard deviations is smaller, since a contact that does not slide does not show it."""
 TYPICAL, LARGE = 1.5, 2.5
 """Claimed errors of bodies relative to those of their true laws, in the median and for `LARGE_SHARE`."""
 LARGE_SHARE, FAMILY_SHARE, CONSTANTS_SHARE = Fraction(9, 10), Fraction(17, 20), Fraction(4, 5)
@@ -29,8 +29,8 @@ COLUMNS = (
 _NOTE = (
     "RMSE of tracers over the video, simulated with the true laws on the same reconstruction, with laws and frictions "
     "identified together, and each body alone from its own mask. Errors of determined constants on the grid, and "
-    "frictions of pairs with their standard deviation. A friction is compared if its standard deviation is below "
-    f"{SLIDES:g}."
+    "frictions of pairs with their standard deviation. A friction is compared if its band of two standard deviations "
+    f"ends less than {2 * SLIDES:g} above it."
 )
 
 
@@ -89,7 +89,7 @@ def piles_table(scenes: Sequence[Mapping[str, Any]], seed: int, is_development: 
             rows.append(
                 [scene["name"], " and ".join(pair["bodies"]), *[None] * 9, right, pair["friction"], std]
             )
-            if std < SLIDES:
+            if pair["friction"] * math.expm1(2 * pair["log_std"]) / 2 < SLIDES:
                 frictions.append(abs(pair["friction"] - right) <= SLIDES)
         rest.append(scene["rest"][1][RMSE] / scene["rest"][0][RMSE])
         single = [alone["rollouts"] for alone in scene["alone"]]

@@ -74,6 +74,28 @@ def test_bodies_of_a_surface_are_nodes_with_their_names(tmp_path):
         )
 
 
+def test_bodies_of_a_surface_are_meshes_of_usd_with_their_names(tmp_path):
+    """A name that USD does not allow is changed."""
+    pytest.importorskip("pxr")
+    from pxr import Usd, UsdGeom
+
+    cube = trimesh.creation.box((0.1, 0.1, 0.1))
+    both = trimesh.util.concatenate([cube, cube.subdivide()])
+    counts = [len(cube.vertices), len(both.vertices) - len(cube.vertices)]
+    vertices, colors = np.stack([both.vertices, both.vertices + 0.2]), np.ones((len(both.vertices), 3))
+    names = list(zip(("duck", "ball+seed=2"), counts, strict=True))
+    write_usd(tmp_path / "a.usda", vertices, both.faces, np.array([0.0, 0.5]), colors, bodies=names)
+    stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
+    parts = stage.GetDefaultPrim().GetChildren()
+    assert [part.GetName() for part in parts] == ["duck", "ball_seed_2"]
+    for part, first, solid in zip(parts, (0, counts[0]), (cube, cube.subdivide()), strict=True):
+        mesh = UsdGeom.Mesh(part)
+        points = np.array(mesh.GetPointsAttr().Get(12.0))  # 24 codes a second
+        np.testing.assert_allclose(points, both.vertices[first : first + len(points)] + 0.2, atol=1e-7)
+        own = trimesh.Trimesh(points, np.array(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3))
+        assert own.is_watertight and own.volume == pytest.approx(solid.volume)
+
+
 def test_scales_and_rotations_make_the_covariances_again():
     g = ball(500).to(dtype=torch.float64)
     flat = dataclasses.replace(g, scales=g.scales * torch.tensor([1.0, 0.1, 1e-4]))

@@ -21,12 +21,10 @@ def main(inputs, output, params, run) -> None:
     colours = vertex_colours(mesh, load_gaussians(inputs.gaussians))
     times = path["frames"] * attributes["dt"]
     around = obstacles(with_obstacles(params.obstacles).get("colliders", ()), times)
-    surface = (output.surface, vertices, mesh.faces, times, colours, around)
-    if Path(output.surface).suffix == ".glb":
-        bodies = read_json(inputs.velocity).get("bodies", ())
-        write_glb(*surface, [(body.get("name", body["scene"]), body["vertices"]) for body in bodies])
-    else:
-        write_usd(*surface)
+    bodies = read_json(inputs.velocity).get("bodies", ())
+    names = [(body.get("name", body["scene"]), body["vertices"]) for body in bodies]
+    write = write_glb if Path(output.surface).suffix == ".glb" else write_usd
+    write(output.surface, vertices, mesh.faces, times, colours, around, names)
     run.log(f"{vertices.shape[0]} frames of {vertices.shape[1]} vertices")
 
 
