@@ -122,7 +122,7 @@ def write_glb(
 
 
 def parts_of(faces: np.ndarray, bodies: Sequence[tuple[str, int]]) -> Iterator[tuple[str, slice, np.ndarray]]:
-    """Name, vertices and faces (M_k, 3) of each body of a surface, the latter with numbers of its own vertices."""
+    """Name, vertices and faces (M_k, 3) of each body of a surface, counted from its first vertex."""
     first, faces = 0, np.asarray(faces)
     for name, count in bodies:
         own = slice(first, first + count)
