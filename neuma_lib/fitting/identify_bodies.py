@@ -26,12 +26,14 @@ from neuma_lib.fitting.families import Bodies, Family
 from neuma_lib.fitting.family_run import FamilyRun
 from neuma_lib.fitting.identified import FamilyFit, Identified
 from neuma_lib.fitting.identify import select_family
-from neuma_lib.fitting.video_residuals import VideoResiduals
+from neuma_lib.fitting.video_residuals import Candidate, VideoResiduals
 from neuma_lib.mechanics.combinations import Values
 from neuma_lib.sim.bodies import Pair
 from neuma_lib.sim.model import MPM
 from neuma_lib.splatting.observation import Observation
 
+MANY_HIDDEN = 0.5
+"""Share of a body that the others hide in some frame from which the summary warns."""
 _FIRST_STARTS = (-2, -1, 1, 2)
 """Powers of 4 of the limits of a flow, and of E, from which a family starts, in addition to its guess."""
 
@@ -44,12 +46,14 @@ class IdentifiedBodies:
         bodies: by name, as `identify` of one body. Its uncertainty includes that of the others.
         particles: number of particles of each body.
         pairs: Coulomb coefficient of each pair of bodies by its name, and the standard deviation of its logarithm.
+        hidden: share of each body that the others hide in each compared frame, (T, bodies), by the identified laws.
         rollouts: number of simulations.
     """
 
     bodies: dict[str, Identified]
     particles: list[int]
     pairs: dict[tuple[str, str], tuple[float, float]]
+    hidden: np.ndarray
     rollouts: int
 
     def as_dict(self) -> dict[str, Any]:
@@ -64,12 +68,19 @@ class IdentifiedBodies:
             for name, count in zip(bodies, self.particles, strict=True)
         ]
         start = {"bodies": starts, "separate": True}
-        return {"bodies": bodies, "pairs": pairs, "start": start, "rollouts": self.rollouts}
+        hidden = dict(zip(bodies, self.hidden.T.tolist(), strict=True))
+        return {"bodies": bodies, "pairs": pairs, "hidden": hidden, "start": start, "rollouts": self.rollouts}
 
     def summary(self) -> list[str]:
         """A line for each body and pair."""
         return [
             *(f"{name}: {each.summary()}" for name, each in self.bodies.items()),
+            *(
+                f"{name}: the others hide {hidden.mean():.0%} of it in the mean and {hidden.max():.0%} at most, so"
+                " that few pixels determine its constants"
+                for name, hidden in zip(self.bodies, self.hidden.T, strict=True)
+                if hidden.max() > MANY_HIDDEN
+            ),
             *(
                 f"friction of {a} and {b}: {value:.2g}, log std {std:.2g}"
                 for (a, b), (value, std) in self.pairs.items()
@@ -207,6 +218,10 @@ class _Search:
                 self.settings,
             )
         together = self._together()
+        frictions = together.pair_frictions(self.values)
+        hidden = video.hidden_shares(
+            Candidate(together.law_spec(self.values), self.deviations, None, frictions)
+        )
         return IdentifiedBodies(
             bodies,
             video.particles,
@@ -214,6 +229,7 @@ class _Search:
                 (self.names[a], self.names[b]): (self.values[key], float(stds[i]))
                 for (a, b), (key, i) in zip(self.pairs, together.pairs.items(), strict=True)
             },
+            np.nan_to_num(hidden.numpy(), nan=1.0),
             video.rollouts,
         )
 

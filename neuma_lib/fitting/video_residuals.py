@@ -32,6 +32,7 @@ from neuma_lib.sim.model import MPM, consecutive, with_fields
 from neuma_lib.sim.rigid_flight import is_rigid, rigid_flight
 from neuma_lib.sim.state import State, Trajectory
 from neuma_lib.splatting.observation import Observation, joint_frames, rendered_steps, several
+from neuma_lib.splatting.spherical_harmonics import rgb_to_sh0
 from neuma_lib.threads import in_threads
 
 MOTION = 6
@@ -224,6 +225,36 @@ class VideoResiduals:
         on = self._fine if fine else self._coarse
         return self._residuals(candidates, *self._paths(candidates, count, on), on, count)
 
+    @torch.no_grad()
+    def hidden_shares(self, one: Candidate) -> Tensor:
+        """Share of each body that the others hide in the images of each frame, (T, bodies), in [0, 1].
+
+        Coverages are summed over pixels and cameras, without blur and the deviations of the rendered bodies. NaN where
+        a body is in no image, or the rollout diverges.
+        """
+        (path,), _ = self._paths([one], len(self.frames), self._coarse)
+        bodies, whole = self._coarse.bodies, join(self._coarse.bodies)
+        alone, visible = torch.zeros(2, len(self.frames), len(bodies), dtype=torch.float64)
+        for film, frames in zip(self._coarse.films, self._own_frames, strict=True) if path else ():
+            renderers = []
+            for k, body in enumerate(bodies):
+                # Its Gaussians in black, those of the others in the white of the background.
+                colours = [torch.full_like(each.gaussians.sh0, j != k) for j, each in enumerate(bodies)]
+                drawn = replace(
+                    whole.gaussians, sh0=rgb_to_sh0(torch.cat(colours)), shN=whole.gaussians.shN[:, :0]
+                )
+                cameras = film.renderer.cameras
+                both = body.particle_gs(cameras), replace(whole, gaussians=drawn).particle_gs(cameras)
+                renderers.append(both)
+            for part in frame_batches(len(frames), film.batch):
+                states, rows = path.at(frames[part]), [self.frames.index(n) for n in frames[part]]
+                x, F = states.x, states.stretch
+                own = zip(x.split(self.particles, dim=1), F.split(self.particles, dim=1), strict=True)
+                for k, ((single, shown), body) in enumerate(zip(renderers, own, strict=True)):
+                    alone[rows, k] += _sums(single.coverage(*body))
+                    visible[rows, k] += _sums(1 - shown(x, F)[..., :1])
+        return (1 - visible / alone).clamp(0, 1)
+
     def differentiate(self, at: Candidate) -> None:
         """Compute the derivatives by the deviations as forward differences, 0 where a rollout diverges."""
         # Shift and enlargement of the rendered body need no rollout.
@@ -359,6 +390,11 @@ def _parts(first: int, last: int, size: int) -> Iterator[slice]:
     if first < last:
         for part in frame_batches(last - first, size):
             yield slice(first + part.start, first + part.stop)
+
+
+def _sums(images: Tensor) -> Tensor:
+    """Sums (T,) over the pixels and cameras of images (T, V, H, W, 1)."""
+    return images.double().sum(dim=(1, 2, 3, 4)).cpu()
 
 
 def _differences(these: Sequence[Tensor], those: Sequence[Tensor]) -> list[Tensor]:

@@ -13,8 +13,8 @@ COLUMNS = ("body", "quantity", "truth", "together", "log_std", "alone", "alone_l
 _NOTE = (
     "RMSE [mm] is that of tracers over the video, simulated with all bodies (`true law`, `together`) or without the "
     "others (`alone`). Its first entry is that of the true laws on the same reconstruction. `alone` is identified from "
-    "the mask of the body, without the others. Standard deviations are those of the logarithm. Constants are those of "
-    "the grid."
+    "the mask of the body, without the others. Other bodies hide a share of a body, by the identified laws. Standard "
+    "deviations are those of the logarithm. Constants are those of the grid."
 )
 
 
@@ -37,6 +37,9 @@ def bodies_table(
     rows: list[list[Any]] = []
     for name, of_law, together, other in ((name, *values) for name, values in errors.items()):
         rows.append([name, "RMSE [mm]", of_law, together, None, other, None])
+        hidden = identified["hidden"][name]
+        for kind, share in (("mean", sum(hidden) / len(hidden)), ("last frame", hidden[-1])):
+            rows.append([name, f"hidden, {kind} [%]", None, 100 * share, None, None, None])
         records = identified["bodies"][name], alone[name]
         spec = truth[name]
         true_family = "+".join(

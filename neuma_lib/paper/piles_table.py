@@ -23,14 +23,14 @@ TYPICAL, LARGE = 1.5, 2.5
 """Claimed errors of bodies relative to those of their true laws, in the median and for `LARGE_SHARE`."""
 LARGE_SHARE, FAMILY_SHARE, CONSTANTS_SHARE = Fraction(9, 10), Fraction(17, 20), Fraction(4, 5)
 COLUMNS = (
-    "scene", "body", "true_law_mm", "together_mm", "alone_mm", "family", "family_is", "alone_family_is",
-    "determined", "determined_within", "error_percent", "truth", "friction", "std",
+    "scene", "body", "hidden_percent", "true_law_mm", "together_mm", "alone_mm", "family", "family_is",
+    "alone_family_is", "determined", "determined_within", "error_percent", "truth", "friction", "std",
 )  # fmt: skip
 _NOTE = (
-    "RMSE of tracers over the video, simulated with the true laws on the same reconstruction, with laws and frictions "
-    "identified together, and each body alone from its own mask. Errors of determined constants on the grid, and "
-    "frictions of pairs with their standard deviation. A friction is compared if its band of two standard deviations "
-    f"ends less than {2 * SLIDES:g} above it."
+    "Share of a body that others hide in the last frame. RMSE of tracers over the video, simulated with the true laws "
+    "on the same reconstruction, with laws and frictions identified together, and each body alone from its own mask. "
+    "Errors of determined constants on the grid, and frictions of pairs with their standard deviation. A friction is "
+    f"compared if its band of two standard deviations ends less than {2 * SLIDES:g} above it."
 )
 
 
@@ -69,6 +69,7 @@ def piles_table(scenes: Sequence[Mapping[str, Any]], seed: int, is_development: 
                 [
                     scene["name"],
                     name,
+                    100 * identified["hidden"][name][-1],
                     *errors,
                     own["family"],
                     *verdicts,
@@ -87,7 +88,7 @@ def piles_table(scenes: Sequence[Mapping[str, Any]], seed: int, is_development: 
             right = math.inf if friction is None else friction
             std = pair["friction"] * pair["log_std"]
             rows.append(
-                [scene["name"], " and ".join(pair["bodies"]), *[None] * 9, right, pair["friction"], std]
+                [scene["name"], " and ".join(pair["bodies"]), *[None] * 10, right, pair["friction"], std]
             )
             if pair["friction"] * math.expm1(2 * pair["log_std"]) / 2 < SLIDES:
                 frictions.append(abs(pair["friction"] - right) <= SLIDES)

@@ -12,6 +12,7 @@ from neuma_lib.coupling.bodies import join
 from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.fitting.families import Bodies, Family
 from neuma_lib.fitting.identify_bodies import identify_bodies
+from neuma_lib.fitting.video_residuals import Candidate, VideoResiduals
 from neuma_lib.io.files import write_json
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.combinations import named_combinations
@@ -116,6 +117,34 @@ def test_a_wrong_motion_is_corrected(filmed):
     fitted = result.bodies["ball"].best.motions[0]
     assert np.abs(fitted.velocity - motions["ball"].velocity)[:2].max() < 0.015
     assert fitted.std[:2].max() < 0.02
+
+
+def test_hidden_share_is_that_of_a_body_behind_another():
+    """Light through the nearer body, (1 - its coverage), shows the other. Nothing hides the nearer one.
+
+    A pixel ends at a transmittance of 1e-4.
+    """
+    bodies = []
+    for x, z in ((0.45, 0.3), (0.5, 0.75)):  # the camera is at z = 2
+        body = ball(height=0.4)
+        shift = torch.tensor([x - 0.5, 0.0, z - 0.5], dtype=torch.float64)
+        moved = replace(body.gaussians, means=body.gaussians.means + shift)
+        bodies.append(replace(body, x0=body.x0 + shift, gaussians=moved))
+    motions = []
+    for body in bodies:
+        centre = (body.mass @ body.x0 / body.mass.sum()).numpy()
+        motions.append(InitialMotion(np.zeros(3), np.zeros(3), centre, np.eye(3), np.zeros(6)))
+    cameras, still = camera(), torch.eye(3, dtype=torch.float64).repeat(1, len(bodies[0].x0), 1, 1)
+    video = Observation((0, 8), torch.ones(2, 1, 32, 32, 3, dtype=torch.float64), cameras)
+    residuals = VideoResiduals(MODEL, motions, bodies, video, IdentifyConfig(pyramid=(4, 32)))
+    shares = residuals.hidden_shares(Candidate([TRUTH["block"]] * 2, np.zeros(18)))
+    behind, before = (body.particle_gs(cameras).coverage(body.x0[None], still) for body in bodies)
+    expected = 1 - (behind * (1 - before)).sum() / behind.sum()
+    assert expected > 0.3
+    torch.testing.assert_close(
+        shares[0], torch.stack([expected, torch.zeros_like(expected)]), atol=2e-4, rtol=0
+    )
+    assert shares.shape == (2, 2) and shares[1, 0] > 0.3 and shares[1, 1] < 1e-6
 
 
 def test_constants_of_bodies_are_those_of_their_families():

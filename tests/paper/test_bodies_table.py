@@ -21,6 +21,7 @@ def test_rows_of_bodies_and_pairs():
     identified = {
         "bodies": {"cat": record("plastic", E=1.9e5, yield_stress=950.0), "ball": record("soft", E=1.1e5)},
         "pairs": [{"bodies": ["cat", "ball"], "friction": 0.4, "log_std": 0.2}],
+        "hidden": {"cat": [0.0, 0.25, 0.5], "ball": [0.0, 0.0, 0.0]},
     }
     alone = {"cat": record("elastic", E=9e4), "ball": record("soft", E=1.5e5)}
     errors = {"cat": [2.0, 3.0, 9.0], "ball": [1.0, 1.5, 4.0]}
@@ -30,6 +31,9 @@ def test_rows_of_bodies_and_pairs():
     assert tuple(header) == COLUMNS
     cells = {(row[0], row[1]): row[2:] for row in rows}
     assert cells["cat", "RMSE [mm]"] == ["2.0", "3.0", "", "9.0", ""]
+    assert (
+        cells["cat", "hidden, mean [%]"][1] == "25.0" and cells["cat", "hidden, last frame [%]"][1] == "50.0"
+    )
     assert cells["cat", "family"] == ["hencky+von_mises", "plastic", "", "elastic", ""]
     assert cells["cat", "yield_stress"] == ["1000.0", "950.0", "0.1", "", ""]
     assert cells["ball", "E"] == ["100000.0", "110000.0", "0.1", "150000.0", "0.1"]

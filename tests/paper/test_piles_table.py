@@ -37,6 +37,7 @@ def scene(name="random9_00", friction=0.35, log_std=0.1, errors=(3.0, 2.0), rest
             {
                 "bodies": bodies,
                 "pairs": [{"bodies": ["cat", "ball"], "friction": friction, "log_std": log_std}],
+                "hidden": {"cat": [0.0, 0.2], "ball": [0.1, 0.6]},
                 "rollouts": 60,
             }
         ],
@@ -56,11 +57,11 @@ def lines(*scenes, development=False):
 
 def test_rows_of_bodies_and_pairs():
     (cat, ball, pair), page = lines(scene())
-    assert cat[:8] == ["random9_00", "cat", "2.0", "3.0", "9.0", "own", "right", "right"]
-    assert ball[5:11] == ["own", "tie", "wrong", "1", "0", "E +30 %"]
-    assert cat[8:11] == ["1", "1", "E +5 %"]
-    assert pair[:2] == ["random9_00", "cat and ball"] and pair[11:13] == ["0.3", "0.35"]
-    assert float(pair[13]) == pytest.approx(0.035)
+    assert cat[:9] == ["random9_00", "cat", "20.0", "2.0", "3.0", "9.0", "own", "right", "right"]
+    assert ball[2] == "60.0" and ball[6:12] == ["own", "tie", "wrong", "1", "0", "E +30 %"]
+    assert cat[9:12] == ["1", "1", "E +5 %"]
+    assert pair[:2] == ["random9_00", "cat and ball"] and pair[12:14] == ["0.3", "0.35"]
+    assert float(pair[14]) == pytest.approx(0.035)
     assert "median 1.25, alone 3.25" in page and "**holds**" in page
 
 
