@@ -111,7 +111,7 @@ def test_a_table_has_a_row_for_each_capture_that_ran(demo):
             "gravity_flight": [1.02, 0.4],
             "gravity_placed": [0.99, 0.2],
             "family": "hencky (wrong)",
-            "quantities": [quantity, vague],
+            "quantities": {"of the material": [quantity, vague], "on the grid": []},
             "core_seconds": 512.3,
         },
         "duck_handheld": {"end": "the camera moves during the video"},
