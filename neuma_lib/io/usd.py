@@ -27,7 +27,7 @@ def write_usd(
 ) -> None:
     """Write a moving surface, y up, in metres; arguments as for `write_glb`. The suffix sets the format: usda, usdc.
 
-    Characters of names that USD does not allow become underscores.
+    Characters of names that USD does not allow become underscores. Equal names get the number of the body.
 
     Raises:
         InputError: usd-core is missing.
@@ -56,8 +56,12 @@ def write_usd(
             mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.asarray(triangles, np.int32).ravel()))
             return mesh
 
-        for name, own, faces_of in parts_of(faces, bodies or [("surface", vertices.shape[1])]):
-            mesh = define(Tf.MakeValidIdentifier(name), faces_of)
+        for k, (name, own, faces_of) in enumerate(
+            parts_of(faces, bodies or [("surface", vertices.shape[1])]), 1
+        ):
+            name = Tf.MakeValidIdentifier(name)
+            taken = stage.GetPrimAtPath(f"/body/{name}").IsValid()
+            mesh = define(f"{name}_{k}" if taken else name, faces_of)
             points, extent = mesh.CreatePointsAttr(), mesh.CreateExtentAttr()
             for code, frame in zip(codes, np.ascontiguousarray(vertices[:, own], np.float32), strict=True):
                 points.Set(Vt.Vec3fArray.FromNumpy(frame), float(code))

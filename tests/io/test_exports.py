@@ -75,7 +75,7 @@ def test_bodies_of_a_surface_are_nodes_with_their_names(tmp_path):
 
 
 def test_bodies_of_a_surface_are_meshes_of_usd_with_their_names(tmp_path):
-    """A name that USD does not allow is changed."""
+    """A name that USD does not allow, or that another body has, is changed."""
     pytest.importorskip("pxr")
     from pxr import Usd, UsdGeom
 
@@ -83,6 +83,11 @@ def test_bodies_of_a_surface_are_meshes_of_usd_with_their_names(tmp_path):
     both = trimesh.util.concatenate([cube, cube.subdivide()])
     counts = [len(cube.vertices), len(both.vertices) - len(cube.vertices)]
     vertices, colors = np.stack([both.vertices, both.vertices + 0.2]), np.ones((len(both.vertices), 3))
+    write_usd(
+        tmp_path / "b.usda", vertices, both.faces, np.zeros(2), colors, bodies=[("one", n) for n in counts]
+    )
+    stage = Usd.Stage.Open(str(tmp_path / "b.usda"))
+    assert [part.GetName() for part in stage.GetDefaultPrim().GetChildren()] == ["one", "one_2"]
     names = list(zip(("duck", "ball+seed=2"), counts, strict=True))
     write_usd(tmp_path / "a.usda", vertices, both.faces, np.array([0.0, 0.5]), colors, bodies=names)
     stage = Usd.Stage.Open(str(tmp_path / "a.usda"))

@@ -8,6 +8,7 @@ from tests.support.full_run import run_in_full
 from tests.support.project import SCENE, TABLE, copied
 
 
+@pytest.hookimpl(tryfirst=True)  # before xdist reads the groups
 def pytest_collection_modifyitems(items):
     """With `--dist loadgroup`, one process has all tests that need the finished run, others go by file."""
     for item in items:
