@@ -1,20 +1,9 @@
 """What the tests of the workflow share: a finished run of Table 1, and one of everything else."""
 
-from pathlib import Path
-
 import pytest
 
 from tests.support.full_run import run_in_full
 from tests.support.project import SCENE, TABLE, copied
-
-
-@pytest.hookimpl(tryfirst=True)  # before xdist reads the groups
-def pytest_collection_modifyitems(items):
-    """With `--dist loadgroup`, one process has all tests that need the finished run, others go by file."""
-    for item in items:
-        if item.path.parent == Path(__file__).parent:
-            shared = "finished" in item.fixturenames
-            item.add_marker(pytest.mark.xdist_group("finished" if shared else item.path.name))
 
 
 @pytest.fixture(scope="session")
