@@ -47,6 +47,7 @@ class IdentifiedBodies:
         particles: number of particles of each body.
         pairs: Coulomb coefficient of each pair of bodies by its name, and the standard deviation of its logarithm.
         hidden: share of each body that the others hide in each compared frame, (T, bodies), by the identified laws.
+            1 where no image shows it.
         rollouts: number of simulations.
     """
 
