@@ -36,12 +36,10 @@ all dataset: env unlock
 	$(SNAKEMAKE) $@
 
 test: env
-	$(BIN)/python -m pytest -m "not slow" -n $(CORES) --ignore=tests/workflow
-	$(BIN)/python -m pytest -m "not slow" tests/workflow
+	$(BIN)/python -m pytest -m "not slow" -n $(CORES)
 
 test-all: env
-	$(BIN)/python -m pytest -n $(CORES) --ignore=tests/workflow
-	$(BIN)/python -m pytest tests/workflow
+	$(BIN)/python -m pytest -n $(CORES)
 
 coverage: env
 	$(BIN)/python -m pytest -m "not slow" -n $(CORES) --ignore=tests/workflow --cov=neuma_lib \

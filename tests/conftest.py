@@ -23,6 +23,34 @@ def pytest_ignore_collect(collection_path: Path, config):
 ROOT = Path(__file__).resolve().parents[1]
 
 
+FINISHED = tuple(
+    f"/test_{name}.py" for name in ("exported_motions", "interrupted", "own_method", "provenance", "workflow")
+)
+"""Ends of the names of files whose tests share a finished run of the workflow, which takes minutes to make."""
+
+
+def pytest_xdist_make_scheduler(config, log):
+    """With several processes, one has all tests of a file, and one has the files that share the finished run.
+
+    Groups of xdist (3.8) have no effect with pytest 9, which does not read the name that they change.
+    """
+    from xdist.scheduler import LoadFileScheduling
+
+    class ByFile(LoadFileScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            file = super()._split_scope(nodeid)
+            return "finished" if file.endswith(FINISHED) else file
+
+    config.option.loadscopereorder = False
+    return ByFile(config, log)
+
+
+def pytest_collection_modifyitems(config, items):
+    """Several processes begin with the tests of the workflow, the longest, so that none is left alone with them."""
+    if hasattr(config, "workerinput"):
+        items.sort(key=lambda item: item.path.parent.name != "workflow")
+
+
 @pytest.fixture(scope="module")
 def raw():
     return loading.read_yaml(ROOT / "config" / "config.yaml")

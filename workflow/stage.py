@@ -18,9 +18,10 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from importlib import import_module
 from pathlib import Path
-from types import SimpleNamespace
-from typing import TextIO
+from types import ModuleType, SimpleNamespace
+from typing import Any, TextIO
 
 from tqdm import tqdm
 
@@ -80,10 +81,32 @@ def stage(name: str, log: str | Path | None = None, stream: TextIO | None = None
             handler.close()
 
 
+class NoCompiler(ModuleType):
+    """Stands for torch's compiler, because optimisers import it, in 0.8 core seconds, to exclude themselves from it.
+
+    Whatever else is asked of it imports it after all.
+    """
+
+    @staticmethod
+    def graph_break() -> None:
+        pass
+
+    @staticmethod
+    def disable(function: Callable, recursive: bool = True, *, wrapping: bool = True) -> Callable:
+        return function
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):  # the import system asks for these
+            raise AttributeError(name)
+        del sys.modules[self.__name__]
+        return getattr(import_module(self.__name__), name)
+
+
 def run_script(main: Callable, snakemake) -> None:
     """Run ``main(input, output, params, run)`` of a script as the stage of its rule and wildcards."""
     gc.freeze()  # otherwise each collection, and the end of the process, visits all objects of the libraries
     gc.enable()
+    sys.modules.setdefault("torch._dynamo", NoCompiler("torch._dynamo"))
     name = " ".join(filter(None, [snakemake.rule, "/".join(filter(None, snakemake.wildcards))]))
     started = _core_seconds()  # of the interpreter and all imports
     with stage(name, snakemake.log[0]) as run:

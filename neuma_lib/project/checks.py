@@ -238,10 +238,8 @@ def _speed_problem(where: str, body: Mapping[str, Any], reach: float, dt: float,
 
 def _contains(collider: ColliderConfig, point: np.ndarray) -> bool:
     """Whether a point [m] is inside a collider at t = 0. Meshes are checked when the truth is simulated."""
-    from scipy.spatial.transform import Rotation
-
     centre, rotation = collider.start
-    y = Rotation.from_rotvec(rotation).inv().apply(point - np.array(centre))
+    y = (point - np.array(centre)) @ rotation_matrix(rotation)
     size = np.array(collider.size)
     if collider.shape == "plane":
         return y[1] < 0

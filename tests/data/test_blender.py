@@ -1,6 +1,5 @@
 """Cameras, colours, and the images of the Blender process."""
 
-import importlib.util
 import json
 import os
 import tempfile
@@ -27,10 +26,8 @@ from neuma_lib.io.images import read_image_set, read_labels
 from neuma_lib.sim.colliders import Collider
 from neuma_lib.splatting import viewpoints as cameras
 from neuma_lib.splatting.cameras import Cameras
+from tests.support.blends import needs_blender
 from tests.support.errors import refused
-
-needs_blender = pytest.mark.skipif(importlib.util.find_spec("bpy") is None, reason="needs Blender (bpy)")
-
 
 # ------------------------------------------------------------------------------------------- cameras
 

@@ -23,6 +23,7 @@ from neuma_lib.io.laws import load_law, save_law
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.sim.colliders import Collider
 from tests.export.test_materials import RHO, spec_of
+from tests.support.blends import needs_blender
 from tests.support.errors import refused
 from tests.support.viewer_project import make_project
 
@@ -152,8 +153,8 @@ def test_newton_moves_a_cube_in_flight_as_this_library(tmp_path):
     assert np.sqrt(np.mean(difference**2)) < 0.03 * np.sqrt(np.mean(moved**2))
 
 
+@needs_blender
 def test_blender_reads_the_coloured_particles(tmp_path):
-    pytest.importorskip("bpy")
     scene = moving_cube(colors=np.random.default_rng(0).random((SIDE**3, 3)))
     export_scene(tmp_path, "newton", scene, spec_of("hencky"), {})
     code = (

@@ -20,6 +20,7 @@ from neuma_lib.fitting.resting import (
 from neuma_lib.fitting.swing import sag
 from neuma_lib.sim.equilibrium import extrapolated
 from tests.support import hanging_beam as beam
+from tests.support.blends import needs_blender
 from tests.support.errors import refused
 
 pytestmark = pytest.mark.core
@@ -126,9 +127,9 @@ def test_contours_next_to_unknown_pixels_are_left_out():
 
 
 @pytest.mark.slow
+@needs_blender
 def test_the_twin_in_blender_has_its_stiffness(tmp_path):
     """Same camera, clamp and size as the recording, rendered by another program, with a box in front of the root."""
-    pytest.importorskip("bpy")
     mask = beam.filmed(beam.resting_beam(0.015), [93.0], tmp_path)
     drawn = beam.image_of(beam.resting_beam(0.015), 93.0)
     assert 0.02 < 1 - mask.sum() / drawn.sum() < 0.4 and not (mask & ~drawn).sum() > 0.01 * mask.sum()

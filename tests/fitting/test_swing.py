@@ -10,6 +10,7 @@ from neuma_lib.io.datasets.stills import read_stills, read_swing
 from neuma_lib.sim.equilibrium import extrapolated
 from tests.fitting.test_resting_records import BODY
 from tests.support import hanging_beam as beam
+from tests.support.blends import needs_blender
 from tests.support.errors import refused
 
 RATIO_OF_TWIN, SHARE, RELEASED, CENTRE_OF_TWIN = 93.0, 0.42, 0.015, (-12, 4)
@@ -60,11 +61,11 @@ def test_viscosity_damps_a_swing():
 
 
 @pytest.mark.slow
+@needs_blender
 def test_the_twin_in_blender_has_its_stiffness_and_damping(tmp_path):
     """Cameras, times and clamp of the recording, a viscous beam on a finer grid, rendered by another program. Wrong at
     the start: stiffness by 14 %, share, release and damping, placement by 3 mm, principal point by 13 px. One third of
     the beam is hidden."""
-    pytest.importorskip("bpy")
     held, frames = twin(0.0075, TIMES, 7e-3, folder=tmp_path)
     motion, poses, place = swing(0.01), [beam.POSE], beam.PLACEMENT + [0.002, -0.002, 0.001]
     options = (held, list(frames.values()), list(frames), motion, poses, place, 0.004)

@@ -1,7 +1,5 @@
 """The demo captures: cameras, poses, pictures and the comparison with the truth."""
 
-import importlib.util
-
 import numpy as np
 import pytest
 import trimesh
@@ -14,6 +12,7 @@ from studies.capture_benchmark.pictures import dead_leaves, page_picture
 from studies.capture_benchmark.planned import capture_settings, planned_captures
 from studies.capture_benchmark.room import Moving, Shot, shoot
 from studies.capture_benchmark.settings import DemoCapturesConfig
+from tests.support.blends import needs_blender
 
 G = 9.81
 LENS = {"width": 160, "height": 120, "focal": 150.0, "center": [83.0, 57.5], "distortion": [-0.09, 0.03]}
@@ -303,7 +302,7 @@ def room():
     return filming.scenery(coarse, page, printed, DEMO.objects["duck"])
 
 
-@pytest.mark.skipif(importlib.util.find_spec("bpy") is None, reason="needs Blender (bpy)")
+@needs_blender
 def test_rendered_pictures_are_where_the_truth_is(room):
     """Corners of the board, and the silhouette of a body that moves, in pictures of a lens with distortion."""
     from neuma_lib.capture.calibration.board import corner_positions, find_board
@@ -331,7 +330,7 @@ def test_rendered_pictures_are_where_the_truth_is(room):
     assert evaluation.iou(red, silhouette) > 0.97
 
 
-@pytest.mark.skipif(importlib.util.find_spec("bpy") is None, reason="needs Blender (bpy)")
+@needs_blender
 def test_a_body_is_blurred_over_the_exposure(room):
     """A straight way of length L, around the frame's time, adds L^2 / 12 to the variance of where the body is seen."""
     eye = next(iter(stage.video_cameras(DEMO).values()))
@@ -357,7 +356,7 @@ def test_a_body_is_blurred_over_the_exposure(room):
     assert np.sqrt(12 * (blurred_spread - spread)) == pytest.approx(np.ptp(ends[:, 1]), rel=0.15)
 
 
-@pytest.mark.skipif(importlib.util.find_spec("bpy") is None, reason="needs Blender (bpy)")
+@needs_blender
 def test_a_rolling_shutter_shears_what_moves_across_the_picture(room):
     """Lower rows are read later, so that a post which moves to the right leans by its way in a row time."""
     eye = next(iter(stage.video_cameras(DEMO).values()))

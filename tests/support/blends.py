@@ -1,5 +1,6 @@
-"""Reader of a .blend file, by Blender in a separate process."""
+"""Blender in a separate process, since its libraries conflict with those of others, and a reader of .blend files."""
 
+import importlib.util
 import json
 import subprocess
 import sys
@@ -7,7 +8,9 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+import pytest
 
+needs_blender = pytest.mark.skipif(importlib.util.find_spec("bpy") is None, reason="needs Blender (bpy)")
 READ = """
 import sys, json, bpy, numpy as np
 bpy.ops.wm.open_mainfile(filepath=sys.argv[1])

@@ -1,15 +1,20 @@
 """What the tests of the workflow share: a finished run of Table 1, and one of everything else."""
 
-import pytest
+from pathlib import Path
 
+import pytest
+import warp as wp
+
+from neuma_lib.device import start_warp
 from tests.support.full_run import run_in_full
 from tests.support.project import SCENE, TABLE, copied
 
 
 @pytest.fixture(scope="session")
-def kernels(tmp_path_factory):
-    """A kernel cache that all copies share."""
-    return tmp_path_factory.mktemp("kernels")
+def kernels():
+    """The kernel cache of all tests, which copies of the project share."""
+    start_warp()
+    return Path(wp.config.kernel_cache_dir).parent  # Warp adds its version
 
 
 @pytest.fixture(scope="session")

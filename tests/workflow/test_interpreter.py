@@ -75,3 +75,31 @@ run_script(lambda *parts: print(gc.isenabled(), gc.get_freeze_count() > 10_000),
         [sys.executable, script], cwd=tmp_path, env=os.environ | {"PYTHONPATH": path}, stdout=subprocess.PIPE
     )
     assert done.stdout == b"True True\n"
+
+
+def test_optimisers_work_without_torchs_compiler_which_is_imported_once_it_is_needed():
+    """Its import includes that of sympy."""
+    script = """
+import sys
+from workflow.stage import NoCompiler
+sys.modules["torch._dynamo"] = NoCompiler("torch._dynamo")
+import torch
+for kind in (torch.optim.Adam, torch.optim.LBFGS):
+    x = torch.ones(2, requires_grad=True)
+    optimizer = kind([x], lr=0.1)
+    loss = lambda: (optimizer.zero_grad(), (x**2).sum())[1]
+    def closure():
+        value = loss()
+        value.backward()
+        return value
+    before = float(loss())
+    optimizer.step(closure)
+    optimizer.load_state_dict(optimizer.state_dict())
+    assert loss() < before
+torch.optim.lr_scheduler.OneCycleLR(optimizer, 1.0, 10, cycle_momentum=False).step()
+print("sympy" in sys.modules)
+torch._dynamo.reset()
+print("sympy" in sys.modules, torch.compile(lambda x: 2 * x, backend="eager")(torch.ones(1)).item())
+"""
+    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True)
+    assert done.stdout.split() == ["False", "True", "2.0"], done.stderr

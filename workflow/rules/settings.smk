@@ -1,5 +1,6 @@
 """Reads and checks the settings; folders, machine, names and functions that every rule shares."""
 
+import gc
 import os
 import shutil
 import sys
@@ -29,6 +30,7 @@ from workflow.records import (
 from workflow.unlock import others
 from workflow.targets import refuse_unknown, requested_targets
 
+gc.set_threshold(100_000)  # by default, searches for garbage take a tenth of Snakemake's start
 show_one_line_a_job(workflow)
 BROKEN = []  # captures that have no scenes, which stop only the targets that need them
 try:
