@@ -100,14 +100,14 @@ def test_files_of_a_swing(tmp_path):
 
 def test_a_record_of_a_swing_has_all_results():
     """With one frame on a coarse grid, for its keys. The outline is that of the prediction."""
-    held, frames = twin(0.015, TIMES[2:3])
+    held, frames = twin(0.02, TIMES[2:3])
     settings = RestingBodyConfig(
         **BODY | {"clamps": {"7 cm": BODY["clamps"]["7 cm"]}, "unit": 1.0, "nu": 0.45}
     )
     region = {"lowest": beam.HELD[0].tolist(), "highest": beam.HELD[1].tolist()}
     own = SwingConfig(body="beam", still="twin", silhouettes="swing", held=region)
     result = swing_record(
-        beam.dumbbell(), settings, own, held, frames, [beam.POSE], {"7 cm": RATIO_OF_TWIN}, 0.03, (0.015,)
+        beam.dumbbell(), settings, own, held, frames, [beam.POSE], {"7 cm": RATIO_OF_TWIN}, 0.03, (0.02,)
     )
     clamp = result["clamps"]["7 cm"]
     (grid,) = clamp["grids"]
