@@ -532,11 +532,12 @@ def test_cases_of_other_models_are_known_to_have_no_own_fit(tiny_settings):
     assert case.folder != case.name and f"{case.scene}/{case.name}" == "Filmed/neuma"
 
 
-def test_one_identification_uses_all_cores_and_several_share_them(project):
-    """The plans have two cores."""
+def test_one_identification_uses_all_cores_and_shares_them_with_others_and_with_fits(project):
+    """The plans have two cores. The correction of identified constants cannot run at the same time."""
     scenes = [f"{RESULTS}/{name}/identified.json" for name in ("BouncyBall", "JellyDuck")]
     changes = overlay(device="cpu", identify={"refined_particles": 0})
-    for targets, threads in ((scenes[:1], 2), (scenes, 1)):
+    fits = [f"{SCENE}/{method}/metrics.json" for method in ("neuma", "neuma_structured")]
+    for targets, threads in ((scenes[:1], 2), (scenes, 1), (fits, 1), (fits[1:], 2)):
         jobs = project.plan(*changes, *targets).of_rule("identify")
-        assert len(jobs) == len(targets)
+        assert len(jobs) == (2 if targets == scenes else 1)
         assert all(("threads: 2" in job.text) == (threads == 2) for job in jobs)

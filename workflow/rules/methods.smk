@@ -274,16 +274,19 @@ def viewer_files(wildcards):
 
 
 def identify_threads(wildcards):
-    """All cores for one identification, an equal share of them for several, at least one.
+    """All cores for one identification, an equal share of them for several, at least one. Fits that can run at the same
+    time have one core each.
 
-    Identifications side by side use cores better than threads, which wait for each other after each batch of rollouts.
-    A GPU and the jobs of a cluster need one core.
+    Jobs side by side use cores better than threads, which wait for each other after each batch of rollouts. A GPU and
+    the jobs of a cluster need one core.
     """
     if GPU or not (workflow.is_main_process and workflow.local_exec):
         return 1
     rules = ("identify", "identify_views", "identify_bodies", "next")
-    jobs = sum(job.rule.name in rules for job in workflow.dag.needrun_jobs())
-    return max(1, workflow.cores // max(1, jobs))
+    jobs = list(workflow.dag.needrun_jobs())
+    fits = [job for job in jobs if job.rule.name.startswith("fit_")]
+    others = sum(not any("/identified" in file for file in job.input) for job in fits)
+    return max(1, (workflow.cores - others) // max(1, sum(job.rule.name in rules for job in jobs)))
 
 
 @checked
