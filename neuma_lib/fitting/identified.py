@@ -81,14 +81,18 @@ class FamilyFit:
 
         Errors of the unbounded constants decrease with dx (thin limbs, layers near the floor) or with dx^2 (smooth
         motion). The result is the limit of second order. Its covariance is increased by the square of the distance to
-        the limit of first order. A constant that changes by more than `_ASYMPTOTIC` between the grids is not
-        extrapolated further than one that changes by as much.
+        the limit of first order. No combination of constants is more certain than in the other fit, because both are of
+        one video. A constant that changes by more than `_ASYMPTOTIC` between the grids is not extrapolated further than
+        one that changes by as much.
         """
         u = self.family.unbounded
         change = u(self.values) - u(coarse.values)
         first, second = (change / (refinement**order - 1) for order in (1, 2))
         covariance, remainder = self.covariance, first - second
         if covariance is not None:
+            if coarse.covariance is not None:
+                variances, axes = np.linalg.eigh(coarse.covariance - covariance)
+                covariance = covariance + axes * np.maximum(variances, 0) @ axes.T
             covariance = covariance + np.outer(remainder, remainder)
         second *= _ASYMPTOTIC / np.maximum(np.abs(change), _ASYMPTOTIC)
         return replace(self, values=self.family.bounded(u(self.values) + second), covariance=covariance)
@@ -96,19 +100,23 @@ class FamilyFit:
     def log_covariance(
         self, of: Callable[[Values], Values], covariance: np.ndarray | None = None
     ) -> tuple[list[str], np.ndarray]:
-        """Names (m,) and covariance (m, m) of logarithms of positive functions of the constants, to first order.
+        """Names (m,) and covariance (m, m) of logarithms of positive functions of the constants.
+
+        Their differences are between one standard deviation on either side along the principal axes of the covariance
+        (Julier and Uhlmann 1997), because a derivative vanishes where a constant is close to its bound.
 
         Args:
             covariance: of the unbounded constants (k, k). None: ``self.covariance``.
         """
-        u, h = self.family.unbounded(self.values), 1e-4
-        names = list(of(self.values))
+        u, names = self.family.unbounded(self.values), list(of(self.values))
+        variances, axes = np.linalg.eigh(self.covariance if covariance is None else covariance)
 
         def logs(point):
             return np.log(list(of(self.family.bounded(point)).values()))
 
-        slope = np.stack([(logs(u + h * e) - logs(u - h * e)) / (2 * h) for e in np.eye(len(u))], axis=1)
-        return names, slope @ (self.covariance if covariance is None else covariance) @ slope.T
+        steps = (axes * np.sqrt(np.maximum(variances, 0))).T
+        halves = np.stack([0.5 * (logs(u + step) - logs(u - step)) for step in steps], axis=1)
+        return names, halves @ halves.T
 
     def as_dict(self, settings: IdentifyConfig) -> dict[str, Any]:
         """Plain numbers for JSON."""

@@ -22,7 +22,7 @@ QUANTITIES = {
     "F": ("1", "elastic deformation gradients, shape (T, N, 3, 3), or (N, 3, 3) of single states"),
     "F_trial": ("1", "the same before the return map of a step, shape (N, 3, 3)"),
     "F_total": ("1", "total deformation gradients, plastic flow included, shape (T, N, 3, 3)"),
-    "C": ("1/s", "APIC affine velocities, shape (T, N, 3, 3)"),
+    "C": ("1/s", "APIC affine velocities, shape (T, N, 3, 3), or (S, P, 3, 3) of P particles at all S steps"),
     "frames": ("1", "simulation step of each frame, shape (T,)"),
     "time": ("s", "time of each frame, shape (T,)"),
     "vol0": ("m^3", "initial particle volumes, shape (N,)"),

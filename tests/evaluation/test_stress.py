@@ -14,6 +14,7 @@ import torch
 from neuma_lib.evaluation.material_point import returned
 from neuma_lib.evaluation.response import half_width
 from neuma_lib.evaluation.stress import PARTS, VisitedStates, stress_errors, visit
+from neuma_lib.io.hdf5 import read_arrays, write_arrays
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.catalogue import lame
 from neuma_lib.mechanics.elasticity import Hencky
@@ -53,7 +54,7 @@ def plastic():
     return of(hencky(yield_stress=YIELD))
 
 
-def test_states_are_after_contact(plastic):
+def test_states_are_after_contact_and_survive_a_file(plastic, tmp_path):
     truth = hencky(yield_stress=YIELD)
     assert plastic.F.shape == (400, 3, 3) and plastic.C.shape == (61, 50, 3, 3)
     assert plastic.frames and set(plastic.frames) <= set(FRAMES)
@@ -61,7 +62,8 @@ def test_states_are_after_contact(plastic):
     strained = (plastic.F - torch.eye(3, dtype=torch.float64)).abs().amax(dim=(1, 2))
     assert (strained > 1e-3).double().mean() > 0.5
     assert ((plastic.F_trial - plastic.F).abs().amax(dim=(1, 2)) > 1e-6).any(), "nothing yields"
-    again = VisitedStates.of_arrays(plastic.arrays())
+    write_arrays(tmp_path / "visited.h5", plastic.arrays())
+    again = VisitedStates.of_arrays(read_arrays(tmp_path / "visited.h5")[0])
     assert torch.equal(again.F, plastic.F) and again.frames == plastic.frames
     assert torch.equal(of(truth).F, plastic.F)
 

@@ -34,7 +34,7 @@ from neuma_lib.fitting.video_residuals import Candidate, VideoResiduals, average
 from neuma_lib.io.files import write_json
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.catalogue import COURANT_LIMIT
-from neuma_lib.mechanics.combinations import named_combinations
+from neuma_lib.mechanics.combinations import named_combinations, physical
 from neuma_lib.methods.base import Problem
 from neuma_lib.methods.spring_gaus.method import SpringGaus
 from neuma_lib.methods.training import Training
@@ -379,10 +379,33 @@ def test_an_extrapolation_covers_both_orders_of_convergence(refinement):
         error, std = math.log(fine.values["E"] / 1e5), math.sqrt(fine.covariance[0, 0] - 1e-6)
         assert abs(error) == pytest.approx(deviations * std, rel=1e-6, abs=1e-9) and std > 1e-3
         assert fine.values["nu"] == pytest.approx(0.3) and fine.covariance[1, 1] == pytest.approx(1e-6)
+    vague = np.array([[0.5, 1e-5], [1e-5, 1e-8]])
+    joined = fit(0.0, 1e-6 * np.eye(2)).extrapolated(fit(0.0, vague), refinement).covariance
+    assert all(np.linalg.eigvalsh(joined - each).min() > -1e-12 for each in (vague, 1e-6 * np.eye(2)))
+    assert np.trace(joined) < np.trace(vague) + 3e-6, "the larger of both, not their sum"
     far = fit(-math.log(9), 1e-6 * np.eye(2)).extrapolated(fit(0.0), refinement)
     limited = -math.log(9) - math.log(2) / (refinement**2 - 1)
     assert math.log(far.values["E"] / 1e5) == pytest.approx(limited)
     assert far.covariance[0, 0] > 0.5 * (math.log(9) / refinement) ** 2
+
+
+def test_a_constant_at_its_bound_leaves_uncertain_what_depends_on_it():
+    """Poisson's ratio next to 0, where its logit is uncertain by 5, may be up to 0.11: the moduli from draws."""
+    family, std = Family("hencky", ELASTIC), 5.0
+    fit = FamilyFit(family, {"E": 1e5, "nu": 0.001}, covariance=np.diag([1e-6, std**2]))
+    names, covariance = fit.log_covariance(physical)
+    u = family.unbounded(fit.values)
+    draws = [family.bounded(u + [0, std * z]) for z in np.random.default_rng(0).standard_normal(20_000)]
+    for name, variance in zip(names, np.diag(covariance), strict=True):
+        low, high = np.quantile([math.log(physical(values)[name]) for values in draws], [0.159, 0.841])
+        assert math.sqrt(variance) > 0.04 and math.sqrt(variance) == pytest.approx((high - low) / 2, rel=0.1)
+    sure = FamilyFit(family, {"E": 1e5, "nu": 0.3}, covariance=1e-6 * np.eye(2))
+    E, G, K = (
+        sure.log_covariance(lambda v, key=key: {key: {**v, **physical(v)}[key]})[1][0, 0] for key in "EGK"
+    )
+    slope = 0.3 * (1 - 0.3 / 0.5)  # of nu by its logit
+    assert E == pytest.approx(1e-6) and G == pytest.approx(1e-6 * (1 + (slope / 1.3) ** 2), rel=1e-4)
+    assert K == pytest.approx(1e-6 * (1 + (2 * slope / 0.4) ** 2), rel=1e-4)
 
 
 def test_a_motion_is_read_moved_and_written():
