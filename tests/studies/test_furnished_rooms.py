@@ -35,7 +35,7 @@ def test_half_of_twelve_captures_have_no_board_and_all_have_furniture(demo):
 
 
 def test_furniture_stands_on_the_floor_next_to_object_and_board(demo, monkeypatch):
-    monkeypatch.setattr("studies.capture_benchmark.furniture.TEXEL", 0.02)  # coarse pictures take a tenth of the time
+    monkeypatch.setattr("studies.capture_benchmark.furniture.TEXEL", 0.02)  # fine pictures take 20 s
     for item in demo.objects.values():
         pieces = furniture(demo.room, item)
         assert len(pieces) == item.difficulties.furniture
