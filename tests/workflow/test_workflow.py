@@ -313,11 +313,13 @@ def test_a_killed_training_and_a_killed_snakemake_resume_with_the_same_result(cl
 
     snakemake, training = started_training(clone)
     assert re.search(r"resumed at iteration \d+ of 600", (clone.root / "started.log").read_text())
+    os.kill(training, signal.SIGSTOP)  # or it may end before Snakemake is killed
     busy = subprocess.run(make, cwd=clone.root, capture_output=True, text=True)
     assert busy.returncode != 0 and f"process {snakemake.pid}" in busy.stdout
     assert f"Another Snakemake is at work in this folder (process {snakemake.pid}" in clone.run(
         full_run.LONG, succeeds=False
     )
+    os.kill(training, signal.SIGCONT)
     os.kill(snakemake.pid, signal.SIGKILL)
     snakemake.wait(60)
     # Its scripts do not go on alone.
