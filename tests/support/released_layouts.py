@@ -16,7 +16,7 @@ from tests.support.board_pictures import looking_at
 OBJECT = "bun"
 UNIT = 0.75  # metres to the files' unit
 RADII = np.array([0.05, 0.04, 0.035])  # of the ellipsoid, in the files' unit
-START = np.array([*MIDDLE, GROUND[OBJECT] - 0.2])
+START = np.array([*MIDDLE, GROUND[OBJECT] - 0.127])  # it touches the ground in the frame CONTACT
 VELOCITY = np.array([0.1, -0.05, 1.2])  # z is down
 SPIN = Rotation.from_rotvec([0.4, 0.2, -0.3]).as_rotvec()
 COUNT, CONTACT = 12, 7
