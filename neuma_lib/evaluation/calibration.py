@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -63,19 +63,6 @@ class Quantiles:
 
 
 NORMAL = Quantiles(tuple(NormalDist().inv_cdf((1 + level) / 2) for level in LEVELS))
-
-
-def measured_quantiles(z: Sequence[float]) -> Quantiles:
-    """Quantiles of errors in estimated standard deviations, of which new ones are below with at least the probability.
-
-    At a level p it is the ceil(p (n + 1))-th smallest of n values, or the largest if there are too few (Lei et al.
-    2018, Theorem 2.1).
-    """
-    sizes, n = np.sort(np.abs(np.asarray(z, dtype=float))), len(z)
-    if n == 0:
-        raise InputError("errors", "there are none to measure quantiles of", "Give more scenes")
-    ranks = [min(n, math.ceil(round(level * (n + 1), 9))) for level in LEVELS]
-    return Quantiles(tuple(float(sizes[rank - 1]) for rank in ranks))
 
 
 @cache
