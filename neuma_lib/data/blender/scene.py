@@ -17,6 +17,7 @@ import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -272,21 +273,15 @@ def run_worker(module: str, job: Path, total: int = 0, progress: Progress | None
 
 
 def render_static(
-    geometry: Surface | Liquid | Several,
-    views: Views,
-    out_dir: str | Path,
-    samples: int,
-    threads: int = 1,
-    progress: Progress | None = None,
-    device: str = "cpu",
-    obstacles: Sequence[Obstacle] = (),
+    geometry: Surface | Liquid | Several, views: Views, out_dir: str | Path, samples: int, **options: Any
 ) -> None:
-    """Render frame 0 from every camera to ``s_<view>.png``, and write transforms.json of those that see the object."""
+    """Render frame 0 from every camera to ``s_<view>.png``, and write transforms.json of those that see the object.
+
+    ``options`` are those of `render_images`.
+    """
     shots = [(0, view) for view in range(len(views))]
     names = [f"s_{view:03d}.png" for _, view in shots]
-    _render_set(
-        geometry, views, shots, names, [0], [0.0], out_dir, obstacles, samples, threads, progress, device
-    )
+    _render_set(geometry, views, shots, names, [0], [0.0], out_dir, samples, **options)
 
 
 def render_dynamic(
@@ -296,10 +291,7 @@ def render_dynamic(
     dt: float,
     out_dir: str | Path,
     samples: int,
-    threads: int = 1,
-    progress: Progress | None = None,
-    device: str = "cpu",
-    obstacles: Sequence[Obstacle] = (),
+    **options: Any,
 ) -> None:
     """Render every frame from every camera to ``d_<view>_<step>.png``, and write transforms.json.
 
@@ -308,22 +300,23 @@ def render_dynamic(
     Args:
         steps: simulation step of each frame of ``geometry``.
         dt: time step [s].
+        options: those of `render_images`.
     """
     if len(steps) != len(geometry):
         raise InputError("steps", f"there are {len(steps)} steps for {len(geometry)} frames of geometry")
     shots = [(frame, view) for frame in range(len(geometry)) for view in range(len(views))]
     names = [f"d_{view}_{steps[frame]:04d}.png" for frame, view in shots]
     times = [float(step) * dt for step in steps]
-    _render_set(
-        geometry, views, shots, names, steps, times, out_dir, obstacles, samples, threads, progress, device
-    )
+    _render_set(geometry, views, shots, names, steps, times, out_dir, samples, **options)
 
 
-def _render_set(geometry, views, shots, names, steps, times, out_dir, obstacles, *options) -> None:
+def _render_set(geometry, views, shots, names, steps, times, out_dir, samples, **options) -> None:
     transforms = Path(out_dir, "transforms.json")
     transforms.unlink(missing_ok=True)  # marks the folder as unfinished
-    render_images(geometry, views, shots, out_dir, names, *options, obstacles=obstacles)
-    masks = (np.asarray(Image.open(Path(out_dir, name)))[..., 3] for name in names if obstacles)
+    render_images(geometry, views, shots, out_dir, names, samples, **options)
+    masks = (
+        np.asarray(Image.open(Path(out_dir, name)))[..., 3] for name in names if options.get("obstacles")
+    )
     visible = [bool((mask > 127).any()) for mask in masks] or [True] * len(names)
     if not any(visible):
         raise InputError("colliders", "hide the body in all images", "Move them, or give the scene images")
