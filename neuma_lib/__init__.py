@@ -3,8 +3,6 @@
 Public names are loaded on first use, so that ``import neuma_lib`` is fast and loads no torch.
 """
 
-from __future__ import annotations
-
 import importlib
 from typing import TYPE_CHECKING, Any
 

@@ -5,8 +5,6 @@ the user. The workflow sets it to a folder of the project, which one job fills, 
 kernels.
 """
 
-from __future__ import annotations
-
 import inspect
 import os
 import re
@@ -25,11 +23,7 @@ from neuma_lib.errors import InputError
 
 
 def choose_device(name: str = "auto") -> torch.device:
-    """The device of a name; "auto" is CUDA if it is available.
-
-    Raises:
-        InputError: torch finds no CUDA device.
-    """
+    """The device of a name; "auto" is CUDA if it is available. Raises InputError: torch finds no CUDA device."""
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
     if name.startswith("cuda") and not torch.cuda.is_available():

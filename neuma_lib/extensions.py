@@ -1,7 +1,5 @@
 """Own methods and laws: Python files that the setting `extensions` names, and entry points of installed packages."""
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 import sys

@@ -1,7 +1,5 @@
 """What all sections of the settings have in common."""
 
-from __future__ import annotations
-
 import typing
 from functools import cache
 from typing import Annotated, Any, Literal

@@ -1,8 +1,6 @@
 """Settings of the board that is printed for captures."""
 
-from __future__ import annotations
-
-from typing import Literal
+from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -26,7 +24,7 @@ class BoardConfig(Section):
     )
 
     @model_validator(mode="after")
-    def _markers_suffice(self) -> BoardConfig:
+    def _markers_suffice(self) -> Self:
         columns, rows = self.squares
         if min(columns, rows) < 3 or columns * rows > 200:
             raise ValueError("squares: expected at least 3 in each direction, and at most 200 in total")

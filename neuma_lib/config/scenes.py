@@ -1,9 +1,7 @@
 """Settings of scenes."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -207,7 +205,7 @@ class SceneConfig(Section):
         return {**dict.fromkeys((*OF_THE_TRUTH, *OF_A_VIDEO)), **raw} if raw.get("captured") else raw
 
     @model_validator(mode="after")
-    def _truth_is_whole(self) -> SceneConfig:
+    def _truth_is_whole(self) -> Self:
         unknown = OF_A_SPLAT if self.splat else dict.fromkeys(OF_THE_TRUTH) if self.bodies else {}
         for key in (*OF_THE_TRUTH, *OF_A_VIDEO):
             if self.captured is None and getattr(self, key) is None and unknown.get(key, ...) is not None:
@@ -219,7 +217,7 @@ class SceneConfig(Section):
         return self
 
     @model_validator(mode="after")
-    def _bodies_are_whole(self) -> SceneConfig:
+    def _bodies_are_whole(self) -> Self:
         if not self.bodies:
             if self.pairs:
                 raise ValueError("pairs: need bodies")
@@ -238,13 +236,13 @@ class SceneConfig(Section):
         return self
 
     @model_validator(mode="after")
-    def _clamped_bodies_rest(self) -> SceneConfig:
+    def _clamped_bodies_rest(self) -> Self:
         if self.clamps and any((*(self.velocity or ()), *self.spin)):
             raise ValueError("clamps: a clamped body starts at rest; set velocity and spin to [0, 0, 0]")
         return self
 
     @model_validator(mode="after")
-    def _frames_ascend(self) -> SceneConfig:
+    def _frames_ascend(self) -> Self:
         frames = self.frames
         if frames is not None and (
             list(frames) != sorted(set(frames))

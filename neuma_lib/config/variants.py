@@ -5,8 +5,6 @@ a scene or experiment has its seeds in the name, except 0. Files that several re
 `replicate_folder`, and are computed once.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Collection, Iterable, Mapping
 

@@ -1,7 +1,5 @@
 """Several bodies on one grid, and solids without a video, with one Gaussian per particle."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

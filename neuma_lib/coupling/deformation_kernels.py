@@ -9,7 +9,6 @@ float32, and write neighbouring results. Frames are the slow index, so the rows 
 its Gaussians read them, about seven times each.
 """
 
-# No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
 import functools
 from types import SimpleNamespace
 

@@ -4,8 +4,6 @@ Algorithm 1 of the paper adds a particle at the centre of every Gaussian that co
 of an image-to-3D model has tens of thousands of such Gaussians on the surface, which would dominate the simulation.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from scipy.spatial import cKDTree

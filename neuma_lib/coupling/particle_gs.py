@@ -1,7 +1,5 @@
 """Particle-GS (paper Sec. 3.3): Gaussians moved by simulated particles and rendered to images."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import torch

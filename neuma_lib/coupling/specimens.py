@@ -1,7 +1,5 @@
 """Specimens of a test: a body with a clamped end, which is released, in the cube of the simulation."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -107,11 +105,7 @@ def clamped_beam(
     dtype: torch.dtype = torch.float32,
     held: tuple[Hexahedra, Equilibrium] | None = None,
 ) -> Specimen:
-    """The beam on a grid with some cells along its height, see `clamped_body`.
-
-    Args:
-        cells: cells along the height.
-    """
+    """The beam on a grid with some cells along its height, see `clamped_body`. ``cells``: cells along the height."""
     dx = beam.height / cells
     count = max(1, round(_PER_CELL * beam.width / dx))
     load = None

@@ -6,8 +6,6 @@ by default, because the paper evaluates a law in the discretisation of its train
 `scenes.<name>.truth` refine the truth.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -22,8 +22,6 @@ are not sampled. A part of the law is sampled even if training did not change it
 Replicates, reconstructions of the same video with other seeds, add a further error. `envelope` contains their bands.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

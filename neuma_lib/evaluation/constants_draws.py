@@ -5,8 +5,6 @@ that normal distribution, with the error that all images share (`identify.model_
 best one get equal parts of the samples.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Coverage and scores of intervals and probabilities, with their confidence over independent scenes."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 from functools import lru_cache

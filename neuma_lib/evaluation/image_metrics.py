@@ -4,8 +4,6 @@ The measures are restricted to the bounding box of the observed and predicted ob
 background is the same for any prediction.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -5,8 +5,6 @@ channels, and the squared differences are weighted by a learned head, averaged o
 weights are numpy arrays in the package `PACKAGE`. `convert` reads them without executing code of their pickles.
 """
 
-from __future__ import annotations
-
 import io as bytes_io
 import pickle
 import pickletools

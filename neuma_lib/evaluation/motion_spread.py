@@ -6,8 +6,6 @@ resolutions is added, divided equally among the three axes. As of constants, the
 with measured quantiles (`calibration`). Friction with obstacles is sampled independently of the law's constants.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Page of the next experiment: the best candidates as pictures, sentences and a table."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path

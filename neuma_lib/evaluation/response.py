@@ -1,7 +1,5 @@
 """Response of laws in tests of a material point, over the range of states of a motion."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial

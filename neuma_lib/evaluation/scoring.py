@@ -1,7 +1,5 @@
 """Score predicted positions of any method by the measures of `neuma_lib.evaluation.motion`."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

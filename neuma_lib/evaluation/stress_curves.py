@@ -4,8 +4,6 @@ Simulated lengths are ``scale`` times those of the room. Times and densities are
 simulated one divided by the square of the scale.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

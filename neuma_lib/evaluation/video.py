@@ -1,7 +1,5 @@
 """Videos of prediction and observation side by side, as mp4 or gif."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from pathlib import Path

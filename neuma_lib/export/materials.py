@@ -6,8 +6,6 @@ sqrt(2) (yield_stress + friction p), since its stress is a vector whose squared 
 engines sum stresses over the volume of undeformed particles or elements.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """The nearest law of another engine to any law, over the states that it has visited."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Experiments that a lab could do next with an object: launch it, press it, hang it, or film it from elsewhere."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Rank what could be filmed next with an object whose material has been identified."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace

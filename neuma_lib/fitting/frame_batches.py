@@ -4,8 +4,6 @@ For renders of 400 frames, autograd would keep tens of gigabytes until the backw
 the gradients with respect to the states batch by batch, and the backward pass only weights them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """Initial Gaussians of a static fit: points sampled in the visual hull, with colours from the images."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

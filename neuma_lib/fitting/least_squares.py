@@ -3,8 +3,6 @@
 Images are reduced to sums J^T J and J^T r per block, so that blocks can be left out afterwards.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Random motions of cubes in a box, on which priors are trained and evaluated."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -9,8 +9,6 @@ are therefore tested on faster motions than those of the training. If they crush
 longer round with the states of these motions follows. The test does not change priors that pass.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from typing import Any

@@ -4,8 +4,6 @@ A regression (`neuma_lib.fitting.prior_regression`) fits a pair of networks to a
 compared with those of the law on unseen motions.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

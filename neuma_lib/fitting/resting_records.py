@@ -1,7 +1,5 @@
 """Stiffness over density of a body from all stills of a record, under each clamp, on two meshes."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any

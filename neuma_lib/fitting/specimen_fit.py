@@ -7,8 +7,6 @@ part separates stiffness at rest, which the sag shows, from that in motion and f
 The simulation damps as well. `numerical_damping` measures it with the same law without its viscous part.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace

@@ -10,8 +10,6 @@ A correction cannot change the kind of its base: an elastic base never flows, an
 If the constants alone do not distinguish such families, corrections of rivals are compared in the same way.
 """
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence

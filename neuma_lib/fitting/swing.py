@@ -9,8 +9,6 @@ The body starts in equilibrium with what holds it, on the mesh of quadratic elem
 fitted. A vibration of angular frequency w then has a damping ratio of w / 2 times that time, and the simulation's own.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace

@@ -1,7 +1,5 @@
 """Frequency and damping of a vibration that dies away."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

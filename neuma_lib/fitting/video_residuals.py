@@ -6,8 +6,6 @@ the apparent material, so a second discretisation, with a finer grid, shorter ti
 simulated instead.
 """
 
-from __future__ import annotations
-
 import math
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Mapping, Sequence

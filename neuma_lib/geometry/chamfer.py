@@ -1,7 +1,5 @@
 """Chamfer distance of two point sets, as a metric (paper Sec. 4.1) and as a loss."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

@@ -1,7 +1,5 @@
 """The surface of a moving body: its mesh at rest, deformed with the particles inside and coloured by its Gaussians."""
 
-from __future__ import annotations
-
 import numpy as np
 import trimesh
 from scipy.spatial import cKDTree

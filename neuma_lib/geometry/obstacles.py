@@ -1,7 +1,5 @@
 """Surfaces of colliders and their motion, for pictures and other programs."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

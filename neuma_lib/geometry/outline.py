@@ -1,7 +1,5 @@
 """The outline of a closed triangle mesh in an image, as points of the mesh, and silhouettes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Repair and isotropic remeshing of surfaces with MeshLab (Cignoni et al. 2008, by pymeshlab)."""
 
-from __future__ import annotations
-
 import importlib.util
 from types import ModuleType
 

@@ -8,8 +8,6 @@ Frame: right-handed, y up, front towards +z and the frontal camera. Nominal size
 Thin parts (necks, ears, tails) have about 6 cm, so that a grid of 24 cells per metre resolves them.
 """
 
-from __future__ import annotations
-
 import difflib
 import re
 import string
@@ -410,11 +408,7 @@ NAMES = tuple(_MAKERS)
 
 @cache
 def shape(name: str) -> Shape:
-    """The solid with a name.
-
-    Raises:
-        InputError: unknown name; the message lists the known ones.
-    """
+    """The solid with a name. Raises InputError: unknown name; the message lists the known ones."""
     if name in _MAKERS:
         return _MAKERS[name]()
     if re.fullmatch(r"letter_[A-Z]", name):

@@ -1,7 +1,5 @@
 """The solid body in a mesh of any quality, for example one that another program wrote."""
 
-from __future__ import annotations
-
 import numpy as np
 import trimesh
 

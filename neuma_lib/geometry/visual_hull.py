@@ -4,8 +4,6 @@ Each alpha matte is converted to a signed distance to its contour at half covera
 of the back-projected distances over the views approximates the signed distance of the hull.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -3,7 +3,6 @@
 Meshes are `trimesh.Trimesh` in metres, watertight and oriented outwards. Points are float64 arrays.
 """
 
-# No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
 from collections.abc import Sequence
 from itertools import combinations, product
 from typing import Literal

@@ -3,8 +3,6 @@
 For formats whose readers allocate before they check, or may crash. The child returns arrays and no objects.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

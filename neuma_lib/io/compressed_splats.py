@@ -6,8 +6,6 @@ name the largest component, 3 x 10 bits hold the others), colour and opacity (8 
 for each coefficient of the higher harmonics, by channel.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Named quantities with units in HDF5: trajectories, sets of particles and sparse matrices."""
 
-from __future__ import annotations
-
 import json
 import mmap
 import re

@@ -1,7 +1,5 @@
 """Mesh files of other programs: OBJ, PLY, STL and GLB."""
 
-from __future__ import annotations
-
 from io import BytesIO
 from pathlib import Path
 

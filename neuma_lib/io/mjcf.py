@@ -1,7 +1,5 @@
 """Deformable bodies of MuJoCo as MJCF text: a flex of tetrahedra, and its constants read back."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path

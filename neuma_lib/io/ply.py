@@ -1,7 +1,5 @@
 """PLY files: vertices with any scalar properties, and triangles. `mesh` and `gaussians` interpret them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from io import BytesIO
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Predicted positions of points in files of other programs: HDF5, npz, or a PLY for each frame."""
 
-from __future__ import annotations
-
 import io
 import re
 import zipfile

@@ -8,8 +8,6 @@
 Coordinates are those of the file. No format defines the up direction.
 """
 
-from __future__ import annotations
-
 import struct
 import zlib
 from dataclasses import fields

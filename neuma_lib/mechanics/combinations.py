@@ -1,7 +1,5 @@
 """Combinations of material constants that can be identifiable from motion when single constants are not."""
 
-from __future__ import annotations
-
 Values = dict[str, float]
 """Constants by name, in SI units and degrees."""
 

@@ -19,8 +19,6 @@ and compute one slice of the result each. Blocks write separate partial sums, an
 order, after each call or after many calls that accumulate in :func:`partial_sums`.
 """
 
-from __future__ import annotations
-
 from functools import cache
 
 import torch

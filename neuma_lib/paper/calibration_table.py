@@ -1,7 +1,5 @@
 """Coverage and scores of intervals of constants and predicted motions, and of probabilities of families."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any

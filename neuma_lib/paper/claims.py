@@ -4,8 +4,6 @@ A claim is a statement and a rule that checks it with a `Frame`, the errors of a
 measures all motion and has no sampling floor. The paper gives Chamfer distances only.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace

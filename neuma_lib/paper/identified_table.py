@@ -1,7 +1,5 @@
 """Identified materials and the true ones: family, errors of the constants, and coverage of their uncertainty."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
@@ -54,11 +52,7 @@ def compare_family(identified: Mapping[str, Any], truth: Mapping[str, Mapping[st
 
 
 def right_families(identified: Mapping[str, Any], truth: Mapping[str, Mapping[str, Any]]) -> set[str]:
-    """Names of the candidates of the family of the true law.
-
-    Args:
-        identified, truth: as of `compare_family`.
-    """
+    """Names of the candidates of the family of the true law. ``identified, truth``: as of `compare_family`."""
     return {name for name, fit in identified["families"].items() if _kind(fit["law"]) == _kind(truth)}
 
 

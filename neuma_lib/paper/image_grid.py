@@ -1,7 +1,5 @@
 """Pictures in rows and columns: data file of a figure, and placement on its page."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """The benchmark of random scenes of several bodies: a row for each body and each pair, and claims on all."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from fractions import Fraction

@@ -1,7 +1,5 @@
 """Numbers that the paper prints, and the claims that a run is checked with (`published.yaml`)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

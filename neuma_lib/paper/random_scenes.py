@@ -1,7 +1,5 @@
 """The benchmark of random scenes: a row for each scene, and statistics over all."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from statistics import geometric_mean

@@ -4,8 +4,6 @@ Claims are checked with the tracer RMSE. The Chamfer distance, the paper's measu
 (`neuma_lib.evaluation.motion` explains its limits).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

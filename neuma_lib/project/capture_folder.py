@@ -1,7 +1,5 @@
 """The folder of a capture: settings, photographs, stills and videos."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 from importlib.util import find_spec

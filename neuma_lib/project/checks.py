@@ -3,8 +3,6 @@
 `neuma check` and every call of Snakemake make the same checks, before the first job.
 """
 
-from __future__ import annotations
-
 import ctypes
 import importlib.metadata
 import math

@@ -1,7 +1,5 @@
 """Checks of settings across sections: names that exist, options that fit their method, independent seeds."""
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Iterator

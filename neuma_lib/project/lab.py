@@ -1,7 +1,5 @@
 """A simulated lab: choose an experiment with an object, render it, identify all videos together, and repeat."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """`load` converts merged YAML into a `Config`. It reads, draws and completes the scenes on the way."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

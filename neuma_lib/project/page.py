@@ -1,7 +1,5 @@
 """Documentation and JSON schema of the public settings, which ``python -m neuma_lib.project.page`` writes."""
 
-from __future__ import annotations
-
 import inspect
 import json
 import typing

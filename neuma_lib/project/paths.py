@@ -3,8 +3,6 @@
 No file is read or has to exist.
 """
 
-from __future__ import annotations
-
 import re
 
 from neuma_lib.config.variants import replicate_folder

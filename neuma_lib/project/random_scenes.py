@@ -5,13 +5,11 @@ Scene k depends on the seed, on k, and on the arguments of `draw_scenes`, but no
 machines have the same scenes.
 """
 
-from __future__ import annotations
-
 import colorsys
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar
+from typing import Annotated, Any, Literal, NamedTuple, Self, TypeVar
 
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, PositiveFloat, model_validator
@@ -126,7 +124,7 @@ class FamilyConfig(Section):
         }
 
     @model_validator(mode="after")
-    def _has_a_wave_speed(self) -> FamilyConfig:
+    def _has_a_wave_speed(self) -> Self:
         ranges = self.elasticity.ranges
         if not {"E", "nu"} <= set(ranges) or ranges["nu"][1] >= 0.5:
             raise ValueError("elasticity: give ranges of E and nu, and nu below 0.5")
@@ -198,7 +196,7 @@ class RandomConfig(Section):
     )
 
     @model_validator(mode="after")
-    def _has_seeds_of_one_kind(self) -> RandomConfig:
+    def _has_seeds_of_one_kind(self) -> Self:
         if both := sorted({*self.development_seeds} & {*self.reported_seeds}):
             raise ValueError(f"development_seeds: {both[0]} is also one of reported_seeds")
         return self

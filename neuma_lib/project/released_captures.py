@@ -1,7 +1,5 @@
 """Released captures: which of their files show an object. `neuma_lib.capture.released` reads them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Keys of the settings that have another name now."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """New settings files of a project: a scene, a capture."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

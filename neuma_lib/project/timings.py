@@ -1,7 +1,5 @@
 """Wall time, core seconds and memory of the stages of a results folder, from benchmark files and logs."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path

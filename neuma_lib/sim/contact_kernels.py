@@ -3,7 +3,6 @@
 `colliders.Collider` has the equations. Several colliders act one after the other.
 """
 
-# No `from __future__ import annotations` here: Warp reads the annotations of functions as objects.
 import functools
 from collections.abc import Sequence
 from types import SimpleNamespace

@@ -4,8 +4,6 @@ A rollout consists of thousands of kernels that take less time than their launch
 steps is therefore recorded once and replayed, on buffers with fixed addresses (`Workspace`).
 """
 
-from __future__ import annotations
-
 import gc
 from collections.abc import Callable, Hashable
 

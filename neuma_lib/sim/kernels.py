@@ -17,7 +17,6 @@ Copies: several independent simulations with equal numbers of particles are stor
 of particles and of nodes. Each body of a copy has its own nodes (`body_contact`).
 """
 
-# No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
 import functools
 from types import SimpleNamespace
 

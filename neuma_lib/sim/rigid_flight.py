@@ -6,8 +6,6 @@ elastic and bears them at a small strain leaves the body rigid, so its centre mo
 conserves angular momentum.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

@@ -10,7 +10,6 @@ The 27 contributions of a particle overlap with those of its neighbours. There a
   numbers, for tests. Sorting affects only the speed.
 """
 
-# No `from __future__ import annotations` here: Warp reads the annotations of functions as objects.
 import functools
 
 import torch

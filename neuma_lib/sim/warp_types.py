@@ -3,7 +3,6 @@
 Arguments of one name have one type in all kernels and functions. Only exceptions have an annotation.
 """
 
-# No `from __future__ import annotations` here: Warp reads the annotations of structs as objects.
 import functools
 from types import SimpleNamespace
 

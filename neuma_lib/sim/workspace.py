@@ -3,8 +3,6 @@
 Nothing is allocated per step. Launches are recorded with fixed memory and only their indices change.
 """
 
-from __future__ import annotations
-
 import math
 import threading
 import weakref

@@ -4,8 +4,6 @@
 oversized and isolated Gaussians, thins the rest, and rotates and moves the object to its initial position.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

@@ -1,7 +1,5 @@
 """Visible extent of Gaussians, which is larger than that of their centres."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Division of Gaussians into bodies by labelled images, and the bodies behind others."""
 
-from __future__ import annotations
-
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor

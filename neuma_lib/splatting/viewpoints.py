@@ -4,8 +4,6 @@ World frame: y up [m]. A pose is a camera-to-world matrix with OpenGL axes (x ri
 ``transforms.json`` and in Blender. The centre of pixel (0, 0) is at (0.5, 0.5), y of the image points down.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -3,8 +3,6 @@
 The same function colours mesh vertices, sand grains and the surface of a liquid (through the particles below it).
 """
 
-from __future__ import annotations
-
 import numpy as np
 import trimesh
 

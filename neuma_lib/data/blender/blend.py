@@ -1,7 +1,5 @@
 """A moving surface as a .blend file, written by a separate Blender process."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path

@@ -3,8 +3,6 @@
 The surface has one shape key per frame and an animated evaluation time.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -5,8 +5,6 @@ the target folder when all are rendered. The object is a `Surface` (moving mesh 
 `Liquid` (a separate surface per frame).
 """
 
-from __future__ import annotations
-
 import io
 import os
 import re

@@ -1,7 +1,5 @@
 """Pictures for figures: video frames, magnified renders, particles, and crops."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Render particles as shaded spheres, for figures."""
 
-from __future__ import annotations
-
 import numpy as np
 
 _LIGHT = np.array([-0.45, -0.75, -0.5]) / np.linalg.norm([-0.45, -0.75, -0.5])

@@ -5,8 +5,6 @@ Widths are those of a two-column page. Fonts have 7 points in print, at least 6.
 in black and white.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass

@@ -14,8 +14,6 @@ spring_gaus    ``camera.json``, a folder each camera  as pac_nerf
 =============  =====================================  ====================================================
 """
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

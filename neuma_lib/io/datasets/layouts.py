@@ -10,8 +10,6 @@ OpenGL axes, y is up. Positions x of their world become ``scale x + offset`` in 
   each camera a folder of that name with RGBA images ``000.png``, ``001.png``, ...
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from pathlib import Path

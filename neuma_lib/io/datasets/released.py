@@ -5,8 +5,6 @@ images named ``<letter>_<view>_<step>.png``. This module converts them to our tr
 reads both.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -10,8 +10,6 @@ body, 0 background, others unknown. They are pictures of the second camera of ``
 ``colour_to_depth_rotation`` and ``colour_to_depth_translation_m``.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -64,11 +62,7 @@ def still_files(root: str | Path, record: str, key: str) -> list[str]:
 
 
 def read_stills(root: str | Path, record: str) -> list[Still]:
-    """All photographs of a record.
-
-    Raises:
-        InputError: a file is missing or damaged, or there is no such record.
-    """
+    """All photographs of a record. Raises InputError: a file is missing or damaged, or there is no such record."""
     masks = still_files(root, record, "mask")
     K = _intrinsics(root, "colour")
     path = Path(root, "calibration.json")
@@ -84,11 +78,7 @@ def read_stills(root: str | Path, record: str) -> list[Still]:
 
 
 def swing_files(root: str | Path, folder: str) -> dict[float, str]:
-    """Label maps of a swing, by their times [s].
-
-    Raises:
-        InputError: the folder has no times.
-    """
+    """Label maps of a swing, by their times [s]. Raises InputError: the folder has no times."""
     path = Path(root, folder, "times.json")
     with reading(path, "times of the label maps of a swing"):
         times = read_json(existing(path, "Give the folder of the records as stills.root"))["figures"]
@@ -96,11 +86,7 @@ def swing_files(root: str | Path, folder: str) -> dict[float, str]:
 
 
 def read_swing(root: str | Path, folder: str) -> dict[float, Still]:
-    """Silhouettes of a swing by their times [s], without markers.
-
-    Raises:
-        InputError: a file is missing or damaged.
-    """
+    """Silhouettes of a swing by their times [s], without markers. Raises InputError: a file is missing or damaged."""
     K, path, camera = _intrinsics(root, "depth"), Path(root, "calibration.json"), np.eye(4)
     with reading(path, "the pose of the second camera"):
         values = read_json(path)

@@ -4,8 +4,6 @@ As in the authors' code, moduli, yield stress and viscosity are stored as log10,
 nu = 0.45 tanh(x / 0.45), and the friction angle in degrees.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any

@@ -5,8 +5,6 @@ nodes before rendering, so that it is trained for this round trip. At given iter
 is restricted to occupied nodes, and Adam restarts.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

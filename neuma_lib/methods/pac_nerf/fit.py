@@ -6,8 +6,6 @@ all. Every image is simulated, transferred to a lattice and rendered along rays,
 The constants and their parametrisation are in `families`.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence

@@ -6,8 +6,6 @@ to the number of points. `render_in_pieces` limits the number at a time, and `su
 before the next is rendered.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ each frame with the gradient through the substeps since the previous frame, whos
 one step for the whole video with the gradient through all substeps.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace

@@ -11,7 +11,6 @@ Anchor i has a list of neighbours j and a stiffness k_i (Spring-Gaus, Zhong et a
 with L n = x_j - x_i and the rest length l_ij. Elongations below `SLACK` have no force, as in the authors' code.
 """
 
-# No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
 import functools
 from types import SimpleNamespace
 

@@ -5,8 +5,6 @@ scenes. NCLaw is the prior rendered by Particle-GS (the paper's NCLaw+R). PAC-Ne
 its radiance field. Paper: fig:image_quality.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from operator import itemgetter
 

@@ -3,8 +3,6 @@ slightly beyond (dashed). Left: renders. Right: mean height of the body over tim
 becomes non-finite, which can happen beyond 1, is held at its last finite frame. Paper: fig:lora_alphav.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import matplotlib

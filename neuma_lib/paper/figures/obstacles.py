@@ -2,8 +2,6 @@
 clay, and sand runs through an hourglass, which is drawn as glass. Not in the paper.
 """
 
-from __future__ import annotations
-
 import tempfile
 from dataclasses import replace
 from pathlib import Path

@@ -3,8 +3,6 @@ views at the start; particles in the colours of the Gaussians bound to them; the
 render, the observation, and their difference, which training reduces. Paper: fig:structure.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import matplotlib

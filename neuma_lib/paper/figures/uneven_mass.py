@@ -3,8 +3,6 @@ of methods that know the two densities or assume one. Bars: tracer RMSE and Cham
 another floor). Paper: fig:uneven_mass.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
