@@ -124,7 +124,6 @@ def sort_pairs(keys: torch.Tensor, values: torch.Tensor, count: int, bits: int =
     Args:
         keys: float32 or int32, shape (2 count,), not negative; the second half is scratch.
         values: int32, of the same shape.
-        count: number of pairs.
         bits: number of lowest bits that may be set in keys.
     """
     with wp.ScopedStream(warp_stream(keys.device), sync_enter=False):

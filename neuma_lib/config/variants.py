@@ -32,9 +32,6 @@ def split_variant(
     """Split ``base+key=value+key=value``.
 
     Args:
-        text: the name.
-        bases: known bases.
-        keys: known keys.
         kind: for messages, for example "method".
 
     Raises:

@@ -133,25 +133,16 @@ def _checked_volumes(volumes: Tensor | float, count: int) -> np.ndarray:
 
 
 class _Columns(NamedTuple):
-    """Points (N, 3) sorted into the cells of a grid: columns over the squares of a plane, divided along z.
+    """Points (N, 3) sorted into the cells of a grid: columns over the squares of a plane, divided along z."""
 
-    Attributes:
-        lower: corner of the grid [m], (3,).
-        sides: sides of a cell [m], (3,), so short along z that points of a column are almost sorted by z.
-        shape: number of cells, (3,).
-        begins: first point of each column, and the end, int32.
-        depths: cell of each point along z, int32, (N,).
-        order: index of each point, int32, (N,).
-        points: positions [m], column after column, ascending in z.
-    """
-
-    lower: Tensor
+    lower: Tensor  # corner of the grid [m], (3,)
+    # sides of a cell [m], (3,), so short along z that points of a column are almost sorted by z
     sides: Tensor
-    shape: Tensor
-    begins: Tensor
-    depths: Tensor
-    order: Tensor
-    points: Tensor
+    shape: Tensor  # number of cells, (3,)
+    begins: Tensor  # first point of each column, and the end, int32
+    depths: Tensor  # cell of each point along z, int32, (N,)
+    order: Tensor  # index of each point, int32, (N,)
+    points: Tensor  # positions [m], column after column, ascending in z
 
     @classmethod
     def of(cls, points: Tensor) -> _Columns:
@@ -175,19 +166,12 @@ class _Columns(NamedTuple):
 
 
 class _Ellipsoids(NamedTuple):
-    """Confidence ellipsoids of Gaussians.
+    """Confidence ellipsoids of Gaussians."""
 
-    Attributes:
-        centres: [m], (G, 3).
-        whitening: matrices W with ``|W d|^2 = d^T A^-1 d``, (G, 3, 3).
-        half: half the sides of the bounding boxes [m], (G, 3).
-        threshold: maximum squared Mahalanobis distance of a bound particle.
-    """
-
-    centres: Tensor
-    whitening: Tensor
-    half: Tensor
-    threshold: float
+    centres: Tensor  # [m], (G, 3)
+    whitening: Tensor  # matrices W with ``|W d|^2 = d^T A^-1 d``, (G, 3, 3)
+    half: Tensor  # half the sides of the bounding boxes [m], (G, 3)
+    threshold: float  # maximum squared Mahalanobis distance of a bound particle
 
     @classmethod
     def of(cls, centres: Tensor, shapes: Tensor, settings: BindingConfig) -> _Ellipsoids:

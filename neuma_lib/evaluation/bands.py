@@ -76,13 +76,11 @@ def corrected_draws(
     """Sample laws around a structured one whose base was identified.
 
     Args:
-        law: the structured law.
         fit: ``best`` of its identified.json.
         visited: elastic deformation gradients of the motion that it predicts, shape (..., 3, 3).
         model_std: see `constants_draws`.
         spread: prior standard deviation of the unbounded constants.
         dt: time step [s].
-        count: number of laws.
 
     Raises:
         InputError: a law of the form "energy".
@@ -108,15 +106,10 @@ def corrected_draws(
 
 @dataclass(frozen=True)
 class RandomField:
-    """Random features of a squared exponential kernel of length `LENGTH`, and 1 as the last feature.
+    """Random features of a squared exponential kernel of length `LENGTH`, and 1 as the last feature."""
 
-    Attributes:
-        frequencies: standard normal, shape (M, 3).
-        phases: in turns, shape (M,).
-    """
-
-    frequencies: np.ndarray
-    phases: np.ndarray
+    frequencies: np.ndarray  # standard normal, shape (M, 3)
+    phases: np.ndarray  # in turns, shape (M,)
 
     def __call__(self, z: Tensor) -> Tensor:
         """Features (N, M + 1) at invariants z (N, 3)."""

@@ -55,7 +55,6 @@ def stable_law(fit: Mapping[str, Any], model: MPM, density: float) -> Law:
 
     Args:
         fit: its entry "best" or "material". The latter was extrapolated, and may be stiffer.
-        model: simulator.
         density: [kg/m^3].
     """
     family = Family("identified", fit["law"])

@@ -13,16 +13,12 @@ CONFIDENCE = 0.95
 
 @dataclass(frozen=True)
 class Intervals:
-    """Intervals at a level and the truths, of one scene.
+    """Intervals at a level and the truths, of one scene."""
 
-    Attributes:
-        low, high: ends.
-        truth: true values, of the same shape.
-    """
-
+    # low, high: ends
     low: np.ndarray
     high: np.ndarray
-    truth: np.ndarray
+    truth: np.ndarray  # true values, of the same shape
 
     @property
     def covered(self) -> np.ndarray:

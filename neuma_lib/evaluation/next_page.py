@@ -104,7 +104,6 @@ def page(choice: Mapping[str, Any], picture: str, place: str) -> str:
     Args:
         choice: content of next.json.
         picture: path of the picture relative to the page.
-        place: folder of the scene.
     """
     candidates = choice["candidates"]
     now = ", ".join(f"{name} {_percent(std)}" for name, std in choice["known"].items())
@@ -167,7 +166,6 @@ def draw(
     """Draw a row of frames for each motion, with the edges of boxes that it touches.
 
     Args:
-        file: picture to write.
         motions: experiment and path of each. The last camera is used.
     """
     from matplotlib.figure import Figure

@@ -24,17 +24,11 @@ EVERY = 5
 
 @dataclass(frozen=True)
 class PointTest:
-    """A test of a material point.
+    """A test of a material point."""
 
-    Attributes:
-        x: prescribed values, (P,).
-        curve: stresses (P',) [Pa] of a law at some of these.
-        visited: visited range of x, or of the stress [Pa] if ``by_stress``.
-    """
-
-    x: Tensor
-    curve: Callable[[Law, Tensor], Tensor]
-    visited: tuple[float, float]
+    x: Tensor  # prescribed values, (P,)
+    curve: Callable[[Law, Tensor], Tensor]  # stresses (P',) [Pa] of a law at some of these
+    visited: tuple[float, float]  # visited range of x, or of the stress [Pa] if ``by_stress``
     by_stress: bool = False
 
 

@@ -23,7 +23,6 @@ def side_by_side(panels: Sequence[np.ndarray], labels: Sequence[str], magnify: i
 
     Args:
         panels: videos (T, H, W, 3) in [0, 1] of one length and height.
-        labels: one for each video.
         magnify: integer factor of enlargement.
 
     Returns:

@@ -35,15 +35,11 @@ to that stress over a rate of one visited strain in 100 steps."""
 
 @dataclass(frozen=True)
 class Fit:
-    """A law that an engine has, fitted to another law.
+    """A law that an engine has, fitted to another law."""
 
-    Attributes:
-        spec: its specification.
-        errors: root mean square of the stress error over that of the stress, in the visited elastic states
-            (``stress``) and after the return map of trial states (``returned``).
-    """
-
-    spec: dict[str, Any]
+    spec: dict[str, Any]  # its specification
+    # root mean square of the stress error over that of the stress, in the visited elastic states (``stress``)
+    # and after the return map of trial states (``returned``)
     errors: dict[str, float]
 
     @property
@@ -58,7 +54,6 @@ def nearest(law: Law, states: Tensor, engine: str, dt: float) -> Fit:
     after the return of trial states, which are visited states with random increments of strain (`INCREMENT`).
 
     Args:
-        law: any law.
         states: elastic deformation gradients that it has visited, (N, 3, 3).
         engine: one of `neuma_lib.export.materials.ENGINES`.
         dt: time step [s].

@@ -87,7 +87,6 @@ def held_out_frames(count: int, share: float, blocks: int = 1, contact: int = 0)
     Args:
         count: number of frames of the video.
         share: share of the frames after the contact.
-        blocks: number of blocks.
         contact: index of the first informative frame. Earlier frames are ignored unless fewer than two remain.
     """
     first = contact if count - contact >= 2 else 0

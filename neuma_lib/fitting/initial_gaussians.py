@@ -32,9 +32,7 @@ def initial_gaussians(
     """Isotropic Gaussians, mostly near the surface of the hull, and their mean spacing [m].
 
     Args:
-        hull: visual hull of the masks.
         images: RGBA images (H, W, 4), for the colours.
-        cameras: their cameras.
         settings: counts, opacity and degree of the harmonics.
         generator: source of the random positions.
     """

@@ -25,20 +25,13 @@ _ROUGH_GAIN = 0.05  # predicted relative gain of a failed step that ends a rough
 
 @dataclass(frozen=True)
 class Linearisation:
-    """The linearised least-squares problem with residuals r and Jacobian J, summed over pixels.
+    """The linearised least-squares problem with residuals r and Jacobian J, summed over pixels."""
 
-    Attributes:
-        curvatures: J^T J of every block of the image, summed over frames, shape (blocks, k, k).
-        scores: J^T r of every block, shape (blocks, k).
-        cost: r^T r.
-        rms: root mean square of r.
-        exact: whether J has been differentiated here, instead of updated from a former point (`secant_update`).
-    """
-
-    curvatures: np.ndarray
-    scores: np.ndarray
-    cost: float
-    rms: float
+    curvatures: np.ndarray  # J^T J of every block of the image, summed over frames, shape (blocks, k, k)
+    scores: np.ndarray  # J^T r of every block, shape (blocks, k)
+    cost: float  # r^T r
+    rms: float  # root mean square of r
+    # whether J has been differentiated here, instead of updated from a former point (`secant_update`)
     exact: bool = True
 
     @property

@@ -35,7 +35,6 @@ def train_prior(
 
     Args:
         spec: the analytic law, see :func:`neuma_lib.mechanics.analytic.analytic_law`.
-        settings: settings of the regression.
         seed: seed of motions, noise, initial weights and batches.
         progress: called with (finished iterations, all iterations, loss).
 

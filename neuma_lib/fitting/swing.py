@@ -62,19 +62,12 @@ _VIBRATION = 4.0  # simulated time for the damping, in durations of the swing
 
 @dataclass(frozen=True, eq=False)
 class Swing:
-    """Motions of a body that is released from an equilibrium, of which the last ones are kept.
+    """Motions of a body that is released from an equilibrium, of which the last ones are kept."""
 
-    Attributes:
-        resting: the body before the release, with its region `held`.
-        spec: its elastic law as plain values.
-        dx: edge of a cell [m].
-        duration: simulated time after the release [s].
-    """
-
-    resting: RestingBody
-    spec: Mapping[str, Any]
-    dx: float
-    duration: float
+    resting: RestingBody  # the body before the release, with its region `held`
+    spec: Mapping[str, Any]  # its elastic law as plain values
+    dx: float  # edge of a cell [m]
+    duration: float  # simulated time after the release [s]
     _paths: dict = field(default_factory=dict)
 
     def path(self, ratio: float, share: float, retardation: float = 0.0) -> CubicSpline:

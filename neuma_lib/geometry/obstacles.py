@@ -20,21 +20,13 @@ PLANE_REACH = 0.75
 
 @dataclass(frozen=True)
 class Obstacle:
-    """A rigid matte surface in motion.
+    """A rigid matte surface in motion."""
 
-    Attributes:
-        vertices: in its own frame [m], shape (V, 3).
-        faces: shape (M, 3), outward.
-        poses: from its frame to the world at each time, shape (T, 4, 4) [m].
-        color: sRGB in [0, 1].
-        opacity: less than 1 shows what is behind it.
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    poses: np.ndarray
-    color: tuple[float, float, float] = GREY
-    opacity: float = 1.0
+    vertices: np.ndarray  # in its own frame [m], shape (V, 3)
+    faces: np.ndarray  # shape (M, 3), outward
+    poses: np.ndarray  # from its frame to the world at each time, shape (T, 4, 4) [m]
+    color: tuple[float, float, float] = GREY  # sRGB in [0, 1]
+    opacity: float = 1.0  # less than 1 shows what is behind it
 
     @property
     def moves(self) -> bool:

@@ -33,7 +33,6 @@ def repaired(mesh: trimesh.Trimesh, edge: float, name: str = "mesh") -> trimesh.
     Args:
         mesh: triangles [m]; may have holes, several bodies and any orientation.
         edge: target length of an edge [m].
-        name: for messages.
 
     Raises:
         InputError: pymeshlab is missing, there are no finite faces, or no closed body is left.

@@ -26,7 +26,6 @@ def solid_body(
 
     Args:
         mesh: triangles in any unit.
-        name: for messages.
         resolution: cells along the longest side.
 
     Returns:

@@ -37,17 +37,11 @@ _FIELD_OF_VIEW = 0.75
 
 @dataclass
 class Hull:
-    """Voxels inside every silhouette.
+    """Voxels inside every silhouette."""
 
-    Attributes:
-        occupied: (X, Y, Z) bool.
-        origin: (3,) corner of the grid [m].
-        voxel: side of a voxel [m].
-    """
-
-    occupied: Tensor
-    origin: Tensor
-    voxel: float
+    occupied: Tensor  # (X, Y, Z) bool
+    origin: Tensor  # (3,) corner of the grid [m]
+    voxel: float  # side of a voxel [m]
 
 
 def check_masks(masks: Tensor | Sequence[Tensor], level: float = MATTE_LEVEL) -> None:

@@ -26,7 +26,6 @@ def arrays_from_child(reader: str, path: str | Path, kind: str) -> dict[str, np.
 
     Args:
         reader: ``module:function`` of a path.
-        path: of the file.
         kind: content of the file, for messages.
 
     Raises:

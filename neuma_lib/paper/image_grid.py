@@ -26,18 +26,12 @@ _TITLE_DISTANCE = 0.04
 
 @dataclass(frozen=True)
 class ImageGrid:
-    """Pictures of one size in rows and columns, with further numbers of the figure.
+    """Pictures of one size in rows and columns, with further numbers of the figure."""
 
-    Attributes:
-        images: colours 0 to 255, uint8, shape (R, C, H, W, 3).
-        rows: R titles.
-        columns: C titles.
-        numbers: other plain numbers, lists and texts of the figure by name.
-    """
-
-    images: np.ndarray
-    rows: tuple[str, ...]
-    columns: tuple[str, ...]
+    images: np.ndarray  # colours 0 to 255, uint8, shape (R, C, H, W, 3)
+    rows: tuple[str, ...]  # R titles
+    columns: tuple[str, ...]  # C titles
+    # other plain numbers, lists and texts of the figure by name
     numbers: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self):

@@ -41,7 +41,6 @@ def piles_table(scenes: Sequence[Mapping[str, Any]], seed: int, is_development: 
             metrics.json with the true laws and the identified ones, ``alone`` and ``alone_metrics``, those of
             identified.json and metrics.json of each body, and ``rest``, those of metrics.json of both laws without the
             first body.
-        seed: of the scenes.
         is_development: whether methods are developed on these scenes. There are no verdicts then.
 
     Raises:

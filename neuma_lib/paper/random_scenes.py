@@ -39,7 +39,6 @@ def random_table(
         scenes: each with ``name``, ``family``, ``prior``, ``metrics`` {method: content of metrics.json} and ``start``,
             the content of initial_state.json.
         titles: method -> name. The first is the prior, the second the method that claims are about.
-        seed: of the scenes.
         is_development: whether methods are developed on these scenes. There are no verdicts then.
 
     Raises:

@@ -24,21 +24,13 @@ OTHER_PICTURES = (".dng", ".cr2", ".nef", ".arw")
 
 @dataclass(frozen=True)
 class Capture:
-    """Files of a capture.
+    """Files of a capture."""
 
-    Attributes:
-        folder: root of the capture.
-        settings: its capture.yaml.
-        photographs: pictures of the object, sorted by name, possibly none yet.
-        stills: camera -> its picture of the empty scene.
-        takes: take -> camera -> video, cameras sorted by name, possibly none yet.
-    """
-
-    folder: Path
-    settings: CaptureConfig
-    photographs: tuple[Path, ...]
-    stills: dict[str, Path]
-    takes: dict[str, dict[str, Path]]
+    folder: Path  # root of the capture
+    settings: CaptureConfig  # its capture.yaml
+    photographs: tuple[Path, ...]  # pictures of the object, sorted by name, possibly none yet
+    stills: dict[str, Path]  # camera -> its picture of the empty scene
+    takes: dict[str, dict[str, Path]]  # take -> camera -> video, cameras sorted by name, possibly none yet
 
     def pictures(self) -> dict[str, tuple[Path, ...]]:
         """Photographs and stills, by group. Raises InputError if photographs, or the still of a camera, are missing."""

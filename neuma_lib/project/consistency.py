@@ -28,11 +28,7 @@ SHARED_BY_VIDEOS = ("law", "prior", "dt", "friction")
 
 
 def check_consistency(settings: Config, root: str | Path = ".") -> None:
-    """Raise an InputError that lists all problems, or all of the methods where there is no other one.
-
-    Args:
-        root: folder of the project.
-    """
+    """Raise an InputError that lists all problems, or all of the methods where there is no other one."""
     for check in (partial(_section_errors, root=root), _method_errors):
         errors: dict[str, InputError] = {}
         for error in check(settings):

@@ -37,7 +37,6 @@ def run_lab(
     config/, so that a lab that is interrupted continues. Writes lab.json and lab.md to the folder.
 
     Args:
-        folder: results of the scene.
         files: settings on top of those of the project.
         experiments: maximum number of experiments, with the existing one.
         make: runs the workflow.

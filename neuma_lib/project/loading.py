@@ -28,7 +28,6 @@ def load(
     Args:
         raw: the YAML as nested dicts. ``scenes_file`` (relative to ``root``) is read, random scenes are drawn, and
             ``scenes`` changes both.
-        root: folder of the project.
         captured: scenes of captures (`neuma_lib.project.capture_scenes`), which ``scenes`` may change as well.
 
     Raises:

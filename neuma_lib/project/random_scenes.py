@@ -24,19 +24,12 @@ Item = TypeVar("Item")
 
 
 class Proportions(NamedTuple):
-    """Proportions of a shape. A test compares them with `geometry.shapes`, which settings do not import.
+    """Proportions of a shape. A test compares them with `geometry.shapes`, which settings do not import."""
 
-    Attributes:
-        size: longest side where a scene does not give it [m].
-        sides: of the bounding box, the longest is 1.
-        mass_centre: centre of mass relative to the centre of the box, in the same unit.
-        parts: parts with a colour.
-    """
-
-    size: float
-    sides: Vector
-    mass_centre: Vector
-    parts: tuple[str, ...]
+    size: float  # longest side where a scene does not give it [m]
+    sides: Vector  # of the bounding box, the longest is 1
+    mass_centre: Vector  # centre of mass relative to the centre of the box, in the same unit
+    parts: tuple[str, ...]  # parts with a colour
 
 
 SHAPES = {

@@ -82,7 +82,6 @@ def new_scene(root: Path, name: str, settings: Config, mesh: str | Path | None =
     """Write config/<name>.yaml with a scene of that name.
 
     Args:
-        root: folder of the project.
         mesh: file with the shape of the object; None: a duck. It is copied to meshes/ if it is outside the project.
 
     Raises:
@@ -113,7 +112,6 @@ def next_scene(root: Path, name: str, settings: Config, folder: Path, rank: int 
     second camera changes the views of the existing scene.
 
     Args:
-        root: folder of the project.
         folder: results of the scene, with next.json.
         rank: of the experiment, from 1.
 

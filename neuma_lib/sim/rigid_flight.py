@@ -48,7 +48,6 @@ def rigid_flight(model: MPM, state: State, steps: Sequence[int], total: bool = F
     inertia I at n = 0 and the constant angular momentum L, by the Runge-Kutta method of fourth order.
 
     Args:
-        model: time step and gravity.
         state: undeformed particles in rigid motion.
         steps: steps of the returned states, increasing.
         total: whether the total deformation is also returned, equal to F.

@@ -32,7 +32,6 @@ def scatter_functions(dtype: torch.dtype, scatter: str, components: int) -> tupl
     """Functions `run_of` and `deposit` for kernels with one particle per thread.
 
     Args:
-        dtype: precision.
         scatter: "atomic", "runs" or "runs_scalar".
         components: 4 if nodes carry momentum and mass, 3 if the last of their four numbers stays zero.
 

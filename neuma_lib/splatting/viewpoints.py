@@ -14,16 +14,11 @@ FIELD_OF_VIEW = 30.0
 
 @dataclass(frozen=True)
 class Views:
-    """Pinhole cameras with common intrinsics, square pixels, and the principal point at the image centre.
+    """Pinhole cameras with common intrinsics, square pixels, and the principal point at the image centre."""
 
-    Attributes:
-        c2w: camera-to-world matrices, OpenGL axes, shape (V, 4, 4) [m].
-        focal: focal length [px].
-        width, height: image size [px].
-    """
-
-    c2w: np.ndarray
-    focal: float
+    c2w: np.ndarray  # camera-to-world matrices, OpenGL axes, shape (V, 4, 4) [m]
+    focal: float  # focal length [px]
+    # width, height: image size [px]
     width: int
     height: int
 

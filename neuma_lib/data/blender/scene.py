@@ -36,19 +36,12 @@ OTHER_PYTHON = "NEUMA_BLENDER_PYTHON"
 
 @dataclass(frozen=True)
 class Surface:
-    """A mesh with moving vertices, or moving balls of one size.
+    """A mesh with moving vertices, or moving balls of one size."""
 
-    Attributes:
-        vertices: positions [m], shape (T, n, 3); centres for balls.
-        faces: vertex indices, shape (m, 3); empty for balls.
-        colors: sRGB colours of the vertices in [0, 1], shape (n, 3).
-        radius: of the balls [m]; 0 for a mesh.
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    colors: np.ndarray
-    radius: float = 0.0
+    vertices: np.ndarray  # positions [m], shape (T, n, 3); centres for balls
+    faces: np.ndarray  # vertex indices, shape (m, 3); empty for balls
+    colors: np.ndarray  # sRGB colours of the vertices in [0, 1], shape (n, 3)
+    radius: float = 0.0  # of the balls [m]; 0 for a mesh
 
     def __len__(self) -> int:
         return len(self.vertices)
@@ -144,10 +137,8 @@ def render_images(
     Args:
         geometry: the object, or several, frames 0 ... len - 1. With several and ``matte``, images of the same names in
             the folder `LABELS` have the number of the visible object, from 1, or 0 where they cover less than half.
-        views: cameras.
         shots: (frame, camera) of each image; shots of one frame should be consecutive.
         out_dir: folder of the images, created if missing; existing images are replaced.
-        names: file name of each shot.
         samples: samples per pixel, denoised (except alpha: 8 are usable, 16 clean).
         threads: CPU cores for Blender.
         progress: called with the numbers of finished and of all images.

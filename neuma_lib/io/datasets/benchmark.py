@@ -44,20 +44,13 @@ warranty. The licence of the software is MIT.
 
 @dataclass(frozen=True, eq=False)
 class _Picture:
-    """An image of a scene.
+    """An image of a scene."""
 
-    Attributes:
-        file: to copy.
-        pixels: straight-alpha RGBA, uint8, shape (H, W, 4).
-        pose: camera to world, OpenGL axes, 4 x 4.
-        intrinsics: [px], 3 x 3.
-        view, step: numbers of the camera and of the simulation step.
-    """
-
-    file: Path
-    pixels: np.ndarray
-    pose: list[list[float]]
-    intrinsics: list[list[float]]
+    file: Path  # to copy
+    pixels: np.ndarray  # straight-alpha RGBA, uint8, shape (H, W, 4)
+    pose: list[list[float]]  # camera to world, OpenGL axes, 4 x 4
+    intrinsics: list[list[float]]  # [px], 3 x 3
+    # view, step: numbers of the camera and of the simulation step
     view: int
     step: int
 

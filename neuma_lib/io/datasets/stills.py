@@ -27,22 +27,15 @@ _CORNERS = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5,
 
 @dataclass(frozen=True, eq=False)
 class Still:
-    """A photograph of a body at rest.
+    """A photograph of a body at rest."""
 
-    Attributes:
-        mask: of the body, shape (H, W).
-        K: intrinsics, pixel centres at half integers, shape (3, 3) [px].
-        marker: corners in the marker's frame, x right, y up, z towards the viewer, shape (M, 3) [m].
-        marker_pixels: shape (M, 2) [px].
-        camera: from the frame of the first camera of the record to that of this one, shape (4, 4).
-        unknown: pixels that may show the body, shape (H, W). None: there are none.
-    """
-
-    mask: NDArray[np.bool_]
-    K: Array
-    marker: Array
-    marker_pixels: Array
+    mask: NDArray[np.bool_]  # of the body, shape (H, W)
+    K: Array  # intrinsics, pixel centres at half integers, shape (3, 3) [px]
+    marker: Array  # corners in the marker's frame, x right, y up, z towards the viewer, shape (M, 3) [m]
+    marker_pixels: Array  # shape (M, 2) [px]
+    # from the frame of the first camera of the record to that of this one, shape (4, 4)
     camera: Array = field(default_factory=lambda: np.eye(4))
+    # pixels that may show the body, shape (H, W). None: there are none.
     unknown: NDArray[np.bool_] | None = None
 
 

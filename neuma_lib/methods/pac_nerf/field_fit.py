@@ -31,26 +31,18 @@ CERTAIN = 1e-5
 
 @dataclass
 class RadianceReport:
-    """Report of a fit.
+    """Report of a fit."""
 
-    Attributes:
-        losses: training loss of every iteration.
-        voxel: voxel of the last lattice [m].
-        nodes: nodes of the last lattice along each axis.
-        particles: number of particles of the final field.
-        held_out: indices of the held-out views.
-        psnr, psnr_object: mean PSNR [dB] of the held-out views rendered with particles, full frame over white and
-            inside the object (pixels with alpha above 1/2).
-        direct_psnr, direct_psnr_object: the same without particles.
-    """
-
-    losses: list[float]
-    voxel: float
-    nodes: tuple[int, int, int]
-    particles: int
-    held_out: list[int]
+    losses: list[float]  # training loss of every iteration
+    voxel: float  # voxel of the last lattice [m]
+    nodes: tuple[int, int, int]  # nodes of the last lattice along each axis
+    particles: int  # number of particles of the final field
+    held_out: list[int]  # indices of the held-out views
+    # psnr, psnr_object: mean PSNR [dB] of the held-out views rendered with particles, full frame over white
+    # and inside the object (pixels with alpha above 1/2)
     psnr: float
     psnr_object: float
+    # direct_psnr, direct_psnr_object: the same without particles
     direct_psnr: float
     direct_psnr_object: float
 
@@ -68,7 +60,6 @@ def fit_radiance_field(
     Args:
         images: RGBA (V, H, W, 4) with straight alpha in [0, 1].
         cameras: their V cameras, more than half of `settings.held_out`.
-        settings: hyper-parameters.
         seed: random seed; the same seed gives the same field on a CPU.
         checkpoint: file for the state, so that an interrupted fit can resume; None for none.
         progress: called with (iteration, loss) after each iteration.

@@ -43,15 +43,10 @@ saves launches.
 
 @dataclass(frozen=True)
 class Opacity:
-    """Shifted softplus: alpha = 1 - (1 + exp(d + b))^-interval with b = log(1 / (1 - initial) - 1).
+    """Shifted softplus: alpha = 1 - (1 + exp(d + b))^-interval with b = log(1 / (1 - initial) - 1)."""
 
-    Attributes:
-        initial: opacity of raw density 0 over an interval of 1.
-        base_voxel: voxel of the coarsest lattice [m], over which the exponent of a ray is `INTERVAL`.
-    """
-
-    initial: float
-    base_voxel: float
+    initial: float  # opacity of raw density 0 over an interval of 1
+    base_voxel: float  # voxel of the coarsest lattice [m], over which the exponent of a ray is `INTERVAL`
 
     @property
     def shift(self) -> float:
@@ -124,12 +119,8 @@ def render(
     `END_LIGHT`) have no gradient.
 
     Args:
-        lattice: positions of the nodes.
         values: raw density and features at the nodes, (X, Y, Z, 1 + C).
-        opacity: activation of the density.
-        colours: colour network.
         origins, directions: origins [m] and unit directions of the rays, (R, 3).
-        background: colour behind the lattice.
         counts: number of points of each ray, (R,), if known (`count_points`).
 
     Returns:
