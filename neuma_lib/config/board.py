@@ -6,8 +6,7 @@ from pydantic import Field, model_validator
 
 from neuma_lib.config.base import Section, internal
 
-PAPERS = {"A4": (0.210, 0.297), "A3": (0.297, 0.420)}
-"""Width and height of a page [m]."""
+PAPERS = {"A4": (0.210, 0.297), "A3": (0.297, 0.420)}  # width and height of a page [m]
 
 
 class BoardConfig(Section):

@@ -57,12 +57,10 @@ class CapturedConfig(Section):
     grid: int | None = internal(None, "grid cells along each side of the box; null: captures.grid", ge=8)
 
 
-MAX_BODIES = 5
-"""Bodies of a scene, as of `neuma_lib.sim.bodies`, which settings do not import."""
+MAX_BODIES = 5  # bodies of a scene, as of `neuma_lib.sim.bodies`, which settings do not import
 OF_THE_TRUTH = ("shape", "height", "velocity", "law", "appearance")
 """Keys of the simulation and the renders of the truth, unknown for a captured object."""
-OF_A_VIDEO = ("steps",)
-"""Keys that follow from the files of a captured video."""
+OF_A_VIDEO = ("steps",)  # keys that follow from the files of a captured video
 OF_A_SPLAT = {
     "size": 0.4, "height": 0.5, "velocity": (0.0, 0.0, 0.0), "dt": 5e-4, "steps": 1000, "prior": "jelly",
     **dict.fromkeys(("shape", "law", "appearance")),

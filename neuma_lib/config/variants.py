@@ -15,8 +15,7 @@ NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 """Names of scenes, methods, captures, takes and cameras. Folders of results are named after them."""
 RESERVED = ("benchmarks", "experiments", "figures", "kernels", "logs", "none", "priors", "weights")
 """Folders of results and data that belong to no scene or method, and what patterns contain in place of no name."""
-SEEDS = ("prior", "gaussians", "particles", "adaptor")
-"""What the seeds of a replicate change, in order."""
+SEEDS = ("prior", "gaussians", "particles", "adaptor")  # what the seeds of a replicate change, in order
 
 
 def name_problem(name: str) -> str:

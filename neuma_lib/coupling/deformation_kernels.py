@@ -20,8 +20,7 @@ from neuma_lib.mechanics.singular_values_kernels import warp_types
 
 start_warp()
 
-PARTS = 3
-"""Groups of four numbers in a row of a vector and a 3x3 matrix."""
+PARTS = 3  # groups of four numbers in a row of a vector and a 3x3 matrix
 
 
 @functools.cache

@@ -19,13 +19,10 @@ from neuma_lib.coupling.particle_binding_kernels import search
 from neuma_lib.device import launch
 from neuma_lib.errors import InputError
 
-_FLATTEST = 1e-12
-"""Minimum eigenvalue of a covariance, relative to its largest one."""
+_FLATTEST = 1e-12  # minimum eigenvalue of a covariance, relative to its largest one
 _CELLS_ALONG_Z = 2**20
-_SHARING_NEIGHBOURS = 16
-"""Number of particles that give volume to an added particle."""
-_MAX_SHARE = 0.5
-"""Maximum fraction of a particle's volume that goes to added particles."""
+_SHARING_NEIGHBOURS = 16  # number of particles that give volume to an added particle
+_MAX_SHARE = 0.5  # maximum fraction of a particle's volume that goes to added particles
 _UNBALANCED = 1e-9
 """Residual, relative to the neighbours' distance, above which no shares balance an added particle."""
 

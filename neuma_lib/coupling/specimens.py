@@ -30,8 +30,7 @@ _GAP = 0.5
 cells, so that the body is held exactly from there on."""
 _PER_CELL = 2  # particles along an edge of a cell
 _COURANT = 0.7
-_NO_VOLUME = 1e-6
-"""Volume of a particle of a load, as a share of that of others."""
+_NO_VOLUME = 1e-6  # volume of a particle of a load, as a share of that of others
 
 
 @dataclass(frozen=True)

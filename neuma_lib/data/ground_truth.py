@@ -22,8 +22,7 @@ from neuma_lib.sim.model import MPM, consecutive
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State, Trajectory
 
-PER_CELL = 8
-"""Particles in a cell of a converged truth."""
+PER_CELL = 8  # particles in a cell of a converged truth
 
 
 @dataclass(frozen=True)

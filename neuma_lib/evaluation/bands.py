@@ -49,17 +49,12 @@ from neuma_lib.mechanics.structured import (
 )
 
 DRAWS = 100
-SILENT = LIMIT / 2
-"""Standard deviation of the deviation of a log-modulus in states without data."""
-LENGTH = 3 * STRAIN
-"""Strain at which features of untrained networks have the correlation exp(-1/2)."""
-FEATURES = 150
-"""Random features of the Gaussian process."""
-STATES = 20_000
-"""Approximate maximum number of states of a motion."""
+SILENT = LIMIT / 2  # standard deviation of the deviation of a log-modulus in states without data
+LENGTH = 3 * STRAIN  # strain at which features of untrained networks have the correlation exp(-1/2)
+FEATURES = 150  # random features of the Gaussian process
+STATES = 20_000  # approximate maximum number of states of a motion
 _DIFFERENCE = 1e-4  # step of an unbounded constant
-Output = tuple[str, int]
-"""Part of a law, and index of an output of its network."""
+Output = tuple[str, int]  # part of a law, and index of an output of its network
 Band = tuple[np.ndarray, np.ndarray]
 
 

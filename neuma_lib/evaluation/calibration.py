@@ -25,8 +25,7 @@ from neuma_lib.errors import InputError
 FILE = Path(__file__).with_suffix(".json")
 LEVELS = tuple(round(0.05 * n, 2) for n in range(1, 20))
 """Levels with a measured quantile. Others between 0 and the last are interpolated."""
-SHOWN = 0.95
-"""Level of the intervals and bands in tables and figures."""
+SHOWN = 0.95  # level of the intervals and bands in tables and figures
 MATERIAL, GRID = "material", "grid"
 MOTION = {MATERIAL: "motion of the material", GRID: "motion on the grid"}
 QUANTITIES = (MATERIAL, GRID, *MOTION.values())

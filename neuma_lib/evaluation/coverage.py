@@ -6,8 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 
-BOOTSTRAP = 2000
-"""Resamplings of the scenes."""
+BOOTSTRAP = 2000  # resamplings of the scenes
 CONFIDENCE = 0.95
 
 

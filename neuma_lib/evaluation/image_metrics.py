@@ -13,8 +13,7 @@ from torch import Tensor
 from neuma_lib.errors import InputError
 from neuma_lib.evaluation.lpips import LPIPS, SMALLEST
 
-VISIBLE = 0.05
-"""Minimum opacity of a pixel of the object."""
+VISIBLE = 0.05  # minimum opacity of a pixel of the object
 MEASURES = ("psnr", "ssim", "lpips_vgg", "lpips_alex")
 
 

@@ -30,12 +30,10 @@ from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 
 SHAPES = ("ball", "duck", "pawn", "cat", "fish", "bottle")
-SPEED = 3.0
-"""Of other motions [m/s]."""
+SPEED = 3.0  # of other motions [m/s]
 CLEARANCE = 0.1
 """Height of another shape above the floor at the start [m], plus what it is lower than ``size``."""
-DRAWS = 32
-"""Sampled laws."""
+DRAWS = 32  # sampled laws
 _TOGETHER = 8  # simulations in memory
 _ONE_STD = (0.158655, 0.841345)  # probabilities of a normal variable below -1 and 1 standard deviations
 

@@ -15,8 +15,7 @@ from neuma_lib.sim.colliders import Collider
 from neuma_lib.sim.state import Trajectory
 from neuma_lib.splatting.cameras import Cameras
 
-SHOWN = 3
-"""Candidates with a picture."""
+SHOWN = 3  # candidates with a picture
 _FRAMES, _PIXELS = 6, 160
 _STRONG = math.log(100)  # evidence that distinguishes families
 

@@ -13,13 +13,10 @@ from neuma_lib.evaluation.bands import band
 from neuma_lib.evaluation.material_point import Visited, largest_shear_stress, sheared, uniaxial, yielding
 from neuma_lib.mechanics.law import Law
 
-BEYOND = 1.6
-"""Range of the tests relative to the visited range, measured from the undeformed state."""
+BEYOND = 1.6  # range of the tests relative to the visited range, measured from the undeformed state
 SMALLEST_STRETCH = 0.05
-POINTS = 121
-"""Points of a curve."""
-EVERY = 5
-"""Points of a curve per point of its band."""
+POINTS = 121  # points of a curve
+EVERY = 5  # points of a curve per point of its band
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,7 @@ from neuma_lib.sim.model import MPM
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 
-STRAINED = 1e-4
-"""Component of F - I above which a body counts as deformed, which marks its first contact."""
+STRAINED = 1e-4  # component of F - I above which a body counts as deformed, which marks its first contact
 PARTS = {
     "stress": "Kirchhoff stress of the visited elastic states",
     "volumetric": "Its volumetric part, the mean of the normal stresses",

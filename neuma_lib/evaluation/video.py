@@ -10,10 +10,8 @@ from PIL import Image, ImageDraw, ImageFont
 from neuma_lib.errors import InputError
 from neuma_lib.extras import require
 
-_LABEL_HEIGHT = 18
-"""Line of text above each panel [px]."""
-_GIF_RATE = 50
-"""Maximum frames per second of a GIF. Browsers replace delays below 20 ms by 100 ms."""
+_LABEL_HEIGHT = 18  # line of text above each panel [px]
+_GIF_RATE = 50  # maximum frames per second of a GIF. Browsers replace delays below 20 ms by 100 ms.
 _REPEATABLE = ("-fflags", "+bitexact", "-flags:v", "+bitexact", "-threads", "1", "-map_metadata", "-1")
 """Encoder options that make the file reproducible: no versions, no dates, one thread."""
 

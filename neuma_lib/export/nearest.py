@@ -16,12 +16,9 @@ from neuma_lib.export.materials import RULES, check_engine, engine_material
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.law import Law
 
-MAX_ERROR = 0.1
-"""Largest relative stress error of a fit that is accepted without force."""
-MAX_STATES = 1000
-"""Approximate number of the visited states that are compared."""
-INCREMENT = 0.1
-"""Strain of a trial state, relative to the visited strains."""
+MAX_ERROR = 0.1  # largest relative stress error of a fit that is accepted without force
+MAX_STATES = 1000  # approximate number of the visited states that are compared
+INCREMENT = 0.1  # strain of a trial state, relative to the visited strains
 _STARTS: dict[str, dict[str, Sequence[float]]] = {
     "identity": {},
     "fluid_projection": {},

@@ -32,8 +32,7 @@ MAX_UNEVEN, MAX_SPREAD = 1e-3, 0.2
 """Largest relative difference of densities that count as one, and standard deviation of volumes over their mean."""
 SCENE_FILES = {"newton": "scene.usda", "mujoco": "scene.xml"}
 """File of a scene that an engine loads itself. A script builds those of Genesis."""
-STICKS = 1e3
-"""Coulomb coefficient of a floor on which nothing slides."""
+STICKS = 1e3  # Coulomb coefficient of a floor on which nothing slides
 SAMPLE_EDGE, SAMPLE_COUNT, SAMPLE_HEIGHT = 0.2, 16, 0.1
 """Edge [m], particles along it, and height above the floor [m] of the cube in the file of a law alone."""
 _KUHN = np.array([[0, 4, 6, 7], [0, 5, 4, 7], [0, 6, 2, 7], [0, 2, 3, 7], [0, 1, 5, 7], [0, 3, 1, 7]])

@@ -36,8 +36,7 @@ from neuma_lib.sim.state import Trajectory
 from neuma_lib.splatting.observation import joint_frames
 from neuma_lib.splatting.viewpoints import video_views
 
-MIN_GAIN = 0.05
-"""Relative decrease of what is ranked below which an experiment is useless."""
+MIN_GAIN = 0.05  # relative decrease of what is ranked below which an experiment is useless
 _LENGTHS = ("height", "center", "velocity", "size", "lowest", "highest")  # settings with lengths [m] or [m/s]
 _IDENTIFY = "Run `snakemake --cores 2 results/<scene>/identified.json` first"
 

@@ -12,12 +12,9 @@ from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.splatting.spherical_harmonics import coefficient_count, rgb_to_sh0
 
-_SHEET_PACKING = 1.15
-"""Squared spacing per area of a point in a hexagonal sheet, 2 / sqrt(3) rounded."""
-_VOLUME_PACKING = 1.41
-"""Cubed spacing per volume of a point in close packing, sqrt(2) rounded."""
-START_SCALE = 0.5
-"""Initial standard deviation relative to the spacing."""
+_SHEET_PACKING = 1.15  # squared spacing per area of a point in a hexagonal sheet, 2 / sqrt(3) rounded
+_VOLUME_PACKING = 1.41  # cubed spacing per volume of a point in close packing, sqrt(2) rounded
+START_SCALE = 0.5  # initial standard deviation relative to the spacing
 _COLOUR_DEPTHS = 0.05
 """Decay length of the weights of cameras in the initial colours, as a share of the mean depth."""
 

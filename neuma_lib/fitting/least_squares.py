@@ -12,10 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-BLOCKS = 4
-"""Blocks along a side of the image for the jackknife."""
-MIN_COST = 1e-12
-"""Lower bound of the cost, so that exact agreement does not make the equations singular."""
+BLOCKS = 4  # blocks along a side of the image for the jackknife
+MIN_COST = 1e-12  # lower bound of the cost, so that exact agreement does not make the equations singular
 _MIN_SHARE = 1e-6  # share of the curvature of a block that shows the body
 _FIRST_DAMPING, _MIN_DAMPING, _MAX_DAMPING = 1e-3, 1e-9, 1e6
 _SECANT_DAMPING = 0.03  # at least, with an updated J, which is inaccurate where the images change little

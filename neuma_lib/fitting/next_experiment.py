@@ -50,8 +50,7 @@ from neuma_lib.sim.state import State
 from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.observation import Observation
 
-_NOISE_RANGE = 1e12
-"""Largest ratio of the noise to the mean curvature, and its inverse."""
+_NOISE_RANGE = 1e12  # largest ratio of the noise to the mean curvature, and its inverse
 
 
 @dataclass(frozen=True)

@@ -17,10 +17,8 @@ from neuma_lib.geometry.chamfer import chamfer_sequence
 from neuma_lib.mechanics.law import Law
 from neuma_lib.mechanics.neural import NeuralLaw
 
-METHOD = "regression"
-"""Training method stored in the files of priors."""
-CLOSE = 0.1
-"""Chamfer distance between prior and law of the best priors of the authors [1e-4 m^2]."""
+METHOD = "regression"  # training method stored in the files of priors
+CLOSE = 0.1  # Chamfer distance between prior and law of the best priors of the authors [1e-4 m^2]
 _EVALUATION_SEEDS = 10_000
 """Offset of the seed for evaluation, so that its motions differ from those of the training."""
 

@@ -27,8 +27,7 @@ from neuma_lib.fitting.vibration import Vibration, fit_vibration
 from neuma_lib.mechanics.combinations import Values
 from neuma_lib.mechanics.law import Law
 
-FRAME = 2.5e-3
-"""Interval of simulated frames [s], between which a cubic spline interpolates."""
+FRAME = 2.5e-3  # interval of simulated frames [s], between which a cubic spline interpolates
 _END = 0.6  # share of the length beyond which markers are
 _NEIGHBOURS = 200  # particles whose affine motion a marker follows
 _DIFFERENCE = 0.03  # of unbounded constants

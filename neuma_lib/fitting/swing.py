@@ -45,14 +45,11 @@ from neuma_lib.sim.equilibrium import extrapolated
 
 Array = NDArray[np.float64]
 
-FRAME = 5e-3
-"""Interval of simulated frames [s], between which a cubic spline interpolates."""
-FIRST_SHARE = 0.6
-"""Share of the weight that is held, before the fit."""
+FRAME = 5e-3  # interval of simulated frames [s], between which a cubic spline interpolates
+FIRST_SHARE = 0.6  # share of the weight that is held, before the fit
 FIRST_RELEASES = (0.0, 0.03, 0.06)
 """Times of release after the first photograph before the fit [s], of which the best is the start."""
-FIRST_RETARDATION = 5e-3
-"""Retardation time before it is fitted [s]."""
+FIRST_RETARDATION = 5e-3  # retardation time before it is fitted [s]
 FITS = {"predicted": (), "fitted": (RATIO,)}
 """Results of a swing on each grid, and the numbers of the shape that each fits in addition to share and release."""
 _NEIGHBOURS = 40  # particles whose affine motion a point of the surface follows

@@ -8,8 +8,7 @@ from torch import Tensor
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.geometry.nearest import nearest
 
-CHAMFER_SCALE = 1e4
-"""Factor of squared metres in the paper's unit."""
+CHAMFER_SCALE = 1e4  # factor of squared metres in the paper's unit
 
 
 def chamfer_sequence(a: Tensor, b: Tensor) -> Tensor:

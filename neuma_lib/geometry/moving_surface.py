@@ -9,8 +9,7 @@ from neuma_lib.geometry.skinning import carry, skinning_matrix
 from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.splatting.spherical_harmonics import sh0_to_rgb
 
-_NEAREST = 4
-"""Number of Gaussians that colour a vertex."""
+_NEAREST = 4  # number of Gaussians that colour a vertex
 
 
 def moving_surface(mesh: trimesh.Trimesh, x: np.ndarray) -> np.ndarray:

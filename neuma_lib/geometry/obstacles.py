@@ -10,10 +10,8 @@ from skimage.measure import marching_cubes
 
 from neuma_lib.sim.colliders import Collider
 
-GREY = (0.49, 0.51, 0.54)
-"""Colour of colliders, sRGB."""
-SIGHTS, SAMPLES = 300, 200
-"""Points of a body and points of each line of sight that are tested for obstacles."""
+GREY = (0.49, 0.51, 0.54)  # colour of colliders, sRGB
+SIGHTS, SAMPLES = 300, 200  # points of a body and points of each line of sight that are tested for obstacles
 PLANE_REACH = 0.75
 """Half the side of the square that stands for a plane [m]: the faces of the unit cube with a margin."""
 

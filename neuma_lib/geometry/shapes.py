@@ -402,8 +402,7 @@ def _letter(character: str) -> Shape:
 
 
 _MAKERS = {"ball": _ball, "duck": _duck, "pawn": _pawn, "cat": _cat, "bottle": _bottle, "fish": _fish}
-NAMES = tuple(_MAKERS)
-"""Named solids, in addition to ``letter_A`` ... ``letter_Z``."""
+NAMES = tuple(_MAKERS)  # named solids, in addition to ``letter_A`` ... ``letter_Z``.
 
 
 @cache

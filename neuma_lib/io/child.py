@@ -15,8 +15,7 @@ import numpy as np
 from neuma_lib.errors import InputError
 from neuma_lib.io.files import one_line
 
-MAX_MEMORY = 384 * 2**20
-"""Address space that a child may add to that of the loaded libraries [bytes]."""
+MAX_MEMORY = 384 * 2**20  # address space that a child may add to that of the loaded libraries [bytes]
 MAX_SECONDS = 30
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 

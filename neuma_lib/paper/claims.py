@@ -12,14 +12,10 @@ import numpy as np
 
 from neuma_lib.evaluation.text_tables import as_markdown
 
-RMSE = "tracer_rmse_mm"
-"""Quantity that claims are checked with, unless they name another."""
-PRINTED = "chamfer_paper"
-"""Chamfer distances in the paper. NaN for columns that the paper does not have."""
-BROKEN = "broke_off"
-"""Runs whose prediction stopped early [%]."""
-MIN_REPLICATES = 3
-"""Number of replicates that a standard deviation needs to support a claim."""
+RMSE = "tracer_rmse_mm"  # quantity that claims are checked with, unless they name another
+PRINTED = "chamfer_paper"  # Chamfer distances in the paper. NaN for columns that the paper does not have.
+BROKEN = "broke_off"  # runs whose prediction stopped early [%]
+MIN_REPLICATES = 3  # number of replicates that a standard deviation needs to support a claim
 
 HOLDS, MIXED, FAILS = "holds", "mixed", "does not hold"
 UNPUBLISHED = "not compared there"

@@ -10,10 +10,8 @@ from neuma_lib.evaluation.text_tables import as_csv, as_markdown
 from neuma_lib.mechanics.combinations import named_combinations
 from neuma_lib.paper.claims import Verdict, counted, verdict_lines
 
-WITHIN = 2.0
-"""Maximum error in estimated standard deviations."""
-CLOSE = 10.0
-"""Maximum error of a constant that counts as right [%]."""
+WITHIN = 2.0  # maximum error in estimated standard deviations
+CLOSE = 10.0  # maximum error of a constant that counts as right [%]
 SHARE = Fraction(4, 5)
 """Claimed share of right families, of errors within `WITHIN` and of errors within `CLOSE`."""
 RIGHT, TIE, WRONG = "right", "tie", "wrong"

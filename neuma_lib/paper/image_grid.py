@@ -16,12 +16,9 @@ from neuma_lib.evaluation.plotting import style
 from neuma_lib.io.files import parse_json
 from neuma_lib.io.hdf5 import read_arrays, write_arrays
 
-GAP = 0.02
-"""Gap between pictures [in]."""
-TITLE = 6.5
-"""Font size of the titles of rows and columns [pt]."""
-_TITLE_DISTANCE = 0.04
-"""Distance of a row's title from its pictures, relative to the width of one."""
+GAP = 0.02  # gap between pictures [in]
+TITLE = 6.5  # font size of the titles of rows and columns [pt]
+_TITLE_DISTANCE = 0.04  # distance of a row's title from its pictures, relative to the width of one
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,7 @@ from neuma_lib.evaluation.text_tables import as_csv, as_markdown
 from neuma_lib.paper.claims import RMSE, counted, verdict_lines
 from neuma_lib.paper.identified_table import WRONG, compare_family, compare_quantities
 
-CLOSE = 15.0
-"""Maximum error of a determined constant that counts as right [%]."""
+CLOSE = 15.0  # maximum error of a determined constant that counts as right [%]
 SLIDES = 0.1
 """Maximum error of a friction that counts as right. It is compared if half the distance to the upper end of its band of
 two standard deviations is smaller, since a contact that does not slide does not show it."""

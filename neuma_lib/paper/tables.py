@@ -39,8 +39,7 @@ QUANTITIES = {
 """Quantities of metrics.json in the order of the CSV, and their headings."""
 FLOOR = "chamfer_floor"
 TRUE_LAW = "true_law"
-REFERENCES = (TRUE_LAW,)
-"""Methods that know the truth and do not compete for the lowest error."""
+REFERENCES = (TRUE_LAW,)  # methods that know the truth and do not compete for the lowest error
 
 TRAINING_DIVERGED, ROLLOUT_DIVERGED = "†", "‡"
 FOOTNOTES = {
@@ -50,8 +49,7 @@ FOOTNOTES = {
 }
 """Signs after numbers, and their meaning."""
 
-ABSORBED = "The true law, simulated as the reconstruction is"
-"""Start of the paragraph of `Table.absorbed`."""
+ABSORBED = "The true law, simulated as the reconstruction is"  # start of the paragraph of `Table.absorbed`
 
 
 @dataclass

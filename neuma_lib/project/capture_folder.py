@@ -12,12 +12,10 @@ from neuma_lib.errors import InputError
 from neuma_lib.io.files import one_line
 from neuma_lib.io.yaml_files import load_yaml
 
-PHOTOGRAPHS = "photographs"
-"""Group of the photographs. Other groups are named after cameras."""
+PHOTOGRAPHS = "photographs"  # group of the photographs. Other groups are named after cameras.
 PICTURES = (".jpg", ".jpeg", ".png", ".webp")
 VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm")
-HEIF = (".heic", ".heif")
-"""Photographs that the package pillow-heif decodes."""
+HEIF = (".heic", ".heif")  # photographs that the package pillow-heif decodes
 OTHER_PICTURES = (".dng", ".cr2", ".nef", ".arw")
 """Formats of cameras that are not supported. They cause an error, so that no photograph is silently ignored."""
 

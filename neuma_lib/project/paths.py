@@ -9,8 +9,7 @@ from neuma_lib.config.variants import replicate_folder
 from neuma_lib.project.settings import Config
 
 FIELD = "pac_nerf/field.safetensors"
-IDENTIFIED = "identified"
-"""Name of the prior that is the law identified from the scene's video."""
+IDENTIFIED = "identified"  # name of the prior that is the law identified from the scene's video
 SEEDS_OF = {
     **dict.fromkeys(
         ["gaussians.ply", "gaussians.json", "whole.ply", "mesh.ply", "tracers.h5", FIELD], ["gaussians"]

@@ -36,8 +36,7 @@ REJECTIONS = {
 }
 """Why a draw is rejected."""
 OF_A_BODY = ("shape", "size", "height", "center", "velocity", "spin", "density", "law")
-NEAR = 1.0
-"""Distance of two bodies relative to the sum of their radii (`_Fall`) at which they touch."""
+NEAR = 1.0  # distance of two bodies relative to the sum of their radii (`_Fall`) at which they touch
 
 
 def draw_piles(

@@ -33,8 +33,7 @@ RENAMED = {
     "tables.*.on_request": "tables.*.default_target",
 }
 """Old path -> new path. A star is the name of a scene, method or table."""
-OPPOSITE = {"tables.*.on_request"}
-"""Old keys whose values are the opposite of the new ones."""
+OPPOSITE = {"tables.*.on_request"}  # old keys whose values are the opposite of the new ones
 
 
 def refuse_old_keys(raw: Mapping[str, Any]) -> None:

@@ -9,8 +9,7 @@ from collections.abc import Callable, Hashable
 
 import torch
 
-MAX_GRAPHS = 16
-"""Graphs kept by a `GraphCache`, which drops the least recently used one."""
+MAX_GRAPHS = 16  # graphs kept by a `GraphCache`, which drops the least recently used one
 
 
 class GraphCache:

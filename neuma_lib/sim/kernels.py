@@ -34,14 +34,11 @@ from neuma_lib.sim.warp_types import typed, warp_types
 
 start_warp()
 
-NO_SLIP, SLIP, STICKY = 0, 1, 2
-"""Codes of the boundary conditions in ``GridConstants.walls``."""
+NO_SLIP, SLIP, STICKY = 0, 1, 2  # codes of the boundary conditions in ``GridConstants.walls``
 
-NO_FAULT = 2**62
-"""Value of a fault flag without a fault."""
+NO_FAULT = 2**62  # value of a fault flag without a fault
 
-NO_CONTACT = -1e3
-"""Radius [m] of clamped particles, which touch no collider."""
+NO_CONTACT = -1e3  # radius [m] of clamped particles, which touch no collider
 
 
 @functools.cache

@@ -15,8 +15,7 @@ from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.model import MPM, law_weights
 from neuma_lib.sim.state import State, Trajectory, cross_matrix
 
-MAX_STRAIN = 0.01
-"""Strain at which a law must bear the centrifugal stress."""
+MAX_STRAIN = 0.01  # strain at which a law must bear the centrifugal stress
 _MAX_ANGLE = 0.05  # rotation in a step of the integration [rad]
 
 

@@ -17,8 +17,7 @@ from neuma_lib.device import start_warp
 
 start_warp()
 
-FOREVER = 2**62
-"""Modulus of an index that is the step itself."""
+FOREVER = 2**62  # modulus of an index that is the step itself
 
 
 class Index(NamedTuple):

@@ -6,8 +6,7 @@ from torch import Tensor
 
 from neuma_lib.splatting.viewpoints import sphere_directions
 
-SEEN = 0.05
-"""Alpha at the border of a Gaussian."""
+SEEN = 0.05  # alpha at the border of a Gaussian
 DIRECTIONS = 100
 """Number of tangent planes in addition to those normal to the axes. Ellipsoids exceed the convex hull by a few percent
 of their largest half-axis."""

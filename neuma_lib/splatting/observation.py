@@ -18,8 +18,7 @@ from torch import Tensor
 from neuma_lib.errors import InputError
 from neuma_lib.splatting.cameras import Cameras
 
-_MIN_SHARE = 0.01
-"""Minimum fraction of a step's time covered by an exposure for the step to be rendered."""
+_MIN_SHARE = 0.01  # minimum fraction of a step's time covered by an exposure for the step to be rendered
 _DEVICE_SHARE = 0.3
 """Maximum fraction of a GPU's free memory for a video; the rollout and the renders need the rest."""
 

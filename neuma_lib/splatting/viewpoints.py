@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-FIELD_OF_VIEW = 30.0
-"""Full horizontal field of view of every camera [degrees], narrow for weak perspective."""
+FIELD_OF_VIEW = 30.0  # full horizontal field of view of every camera [degrees], narrow for weak perspective
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,7 @@ from neuma_lib.config.blender import AppearanceConfig
 from neuma_lib.errors import InputError
 from neuma_lib.geometry import shapes
 
-BORDER = 0.008
-"""Width of the borders between parts [m]."""
+BORDER = 0.008  # width of the borders between parts [m]
 
 
 def parse_color(text: str) -> np.ndarray:

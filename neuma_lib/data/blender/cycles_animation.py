@@ -12,8 +12,7 @@ from mathutils import Matrix
 
 from neuma_lib.data.blender import cycles
 
-RATE = 24
-"""Blender's frames per second."""
+RATE = 24  # Blender's frames per second
 
 
 def main(path: str) -> None:

@@ -30,8 +30,7 @@ from neuma_lib.io.processes import start_child
 from neuma_lib.splatting.viewpoints import Views
 
 Progress = Callable[[int, int], None]
-OTHER_PYTHON = "NEUMA_BLENDER_PYTHON"
-"""Environment variable with another interpreter that has bpy."""
+OTHER_PYTHON = "NEUMA_BLENDER_PYTHON"  # environment variable with another interpreter that has bpy
 
 
 @dataclass(frozen=True)
@@ -115,8 +114,7 @@ class Several:
         return {"bodies": np.array(len(self.bodies)), **named}
 
 
-LABELS = "labels"
-"""Folder of the label images, in that of the images."""
+LABELS = "labels"  # folder of the label images, in that of the images
 
 
 def render_images(

@@ -31,8 +31,7 @@ from neuma_lib.io.images import image_file, read_image_set, read_transforms, wri
 from neuma_lib.io.positions import write_points
 
 PARTS = ("static", "dynamic")
-TRUTH = "truth"
-"""Folder of what a method must not read."""
+TRUTH = "truth"  # folder of what a method must not read
 MOTION = ("tracers", "tracers_again", "frames", "time")
 LICENSE = """\
 The images, cameras and motions in this folder were generated with the software "NeuMA, done right" and are licensed

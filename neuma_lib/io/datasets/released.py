@@ -14,8 +14,7 @@ import numpy as np
 
 from neuma_lib.errors import InputError
 
-MAX_POSITION = 1e6
-"""Maximum coordinate of a camera [m]."""
+MAX_POSITION = 1e6  # maximum coordinate of a camera [m]
 _NAME = re.compile(r"[a-z]+_(\d{1,9})_(\d{1,9})$", re.IGNORECASE)
 
 

@@ -28,8 +28,7 @@ from neuma_lib.splatting.cameras import Cameras
 OCCUPIED = 1e-7
 """Refinement keeps the nodes with at least this share of the largest opacity and their neighbours (an absolute opacity
 in PAC-NeRF)."""
-STIFFNESS_POWER = 3
-"""Stiffness scales with this power of the opacity of a particle (PAC-NeRF's code)."""
+STIFFNESS_POWER = 3  # stiffness scales with this power of the opacity of a particle (PAC-NeRF's code)
 MAX_NODES = 20_000_000
 """Nodes of a lattice, of 52 bytes each, three times as many with those of the optimiser."""
 WHITE = (1.0, 1.0, 1.0)

@@ -23,10 +23,8 @@ from neuma_lib.methods.pac_nerf.rendering import Opacity, camera_rays
 from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.observation import over_white
 
-VOLUME_RANGE = (1e-4, 1e-1)
-"""Range of opacities in the volume term (PAC-NeRF)."""
-CERTAIN = 1e-5
-"""Minimum distance of transmittances from 0 and 1 in their entropy (PAC-NeRF)."""
+VOLUME_RANGE = (1e-4, 1e-1)  # range of opacities in the volume term (PAC-NeRF)
+CERTAIN = 1e-5  # minimum distance of transmittances from 0 and 1 in their entropy (PAC-NeRF)
 
 
 @dataclass

@@ -26,14 +26,12 @@ from neuma_lib.sim.model import COURANT_LIMIT, MPM
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.splatting.observation import Observation
 
-MAX_HALVINGS = 4
-"""Maximum number of halvings of the time step."""
+MAX_HALVINGS = 4  # maximum number of halvings of the time step
 MIN_STEP = 1e-3
 """L-BFGS ends if a step changes every component of the velocity by at most this [m/s] (PAC-NeRF)."""
 MIN_GAIN = 1e-6
 """Share of the first loss by which a step of L-BFGS must lower the loss, tied to `MIN_STEP` in torch."""
-HISTORY = 20
-"""History size of L-BFGS (PAC-NeRF)."""
+HISTORY = 20  # history size of L-BFGS (PAC-NeRF)
 
 
 class Video:

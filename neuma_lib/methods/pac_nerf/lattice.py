@@ -13,8 +13,7 @@ from neuma_lib.errors import InputError
 
 EMPTY = -100.0
 """Value of all channels at a node without particles, which as raw density has no opacity (PAC-NeRF)."""
-MIN_WEIGHT = 1e-10
-"""Sum of weights up to which a node is empty (PAC-NeRF)."""
+MIN_WEIGHT = 1e-10  # sum of weights up to which a node is empty (PAC-NeRF)
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,8 @@ from pydantic import Field, model_validator
 from neuma_lib.config.base import Section, internal
 from neuma_lib.config.laws import LawConfig
 
-MODULI = ("mu", "kappa")
-"""Shear and bulk modulus [Pa], which a family may be fitted in instead of E and nu."""
-FITTED = ("E", "nu", *MODULI, "yield_stress", "viscosity", "friction_angle")
-"""Constants that can be fitted."""
+MODULI = ("mu", "kappa")  # shear and bulk modulus [Pa], which a family may be fitted in instead of E and nu
+FITTED = ("E", "nu", *MODULI, "yield_stress", "viscosity", "friction_angle")  # constants that can be fitted
 
 
 class PacFamilyConfig(LawConfig):

@@ -20,18 +20,13 @@ from neuma_lib.methods.pac_nerf.lattice import Lattice, interpolate
 from neuma_lib.methods.pac_nerf.marching_kernels import kernels, place_of, warp_types
 from neuma_lib.splatting.cameras import Cameras
 
-FEATURES = 12
-"""Number of colour features of a node, in addition to its raw density."""
-STEP = 0.5
-"""Distance between two points of a ray [voxels]."""
+FEATURES = 12  # number of colour features of a node, in addition to its raw density
+STEP = 0.5  # distance between two points of a ray [voxels]
 INTERVAL = 0.1
 """Exponent of the transmittance of a voxel on the coarsest lattice (PAC-NeRF), proportional to the voxel."""
-NEAR = 0.1
-"""Distance from the camera at which rays start [m]."""
-MIN_LIGHT = 1e-7
-"""Weight T alpha up to which a point is omitted, without gradient."""
-END_LIGHT = 1e-3
-"""Transmittance below which a ray ends (DVGO)."""
+NEAR = 0.1  # distance from the camera at which rays start [m]
+MIN_LIGHT = 1e-7  # weight T alpha up to which a point is omitted, without gradient
+END_LIGHT = 1e-3  # transmittance below which a ray ends (DVGO)
 POINTS_AT_ONCE = {"cpu": 2**16, "cuda": 2**20}
 """Maximum number of points plus rays in a piece of an image, by type of device.
 

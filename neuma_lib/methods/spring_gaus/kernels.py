@@ -21,10 +21,8 @@ from neuma_lib.device import start_warp, typed
 
 start_warp()
 
-SLACK = 1e-6
-"""Elongation below which a spring has no force [m]."""
-MIN_LENGTH = 1e-12
-"""Distance of two anchors below which their direction is undefined [m]."""
+SLACK = 1e-6  # elongation below which a spring has no force [m]
+MIN_LENGTH = 1e-12  # distance of two anchors below which their direction is undefined [m]
 
 
 @functools.cache
