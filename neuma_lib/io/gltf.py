@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +56,9 @@ def write_glb(
         return len(accessors) - 1
 
     colors, meshes = linear(colors).astype("<f4"), []
-    for name, own, faces_of in parts_of(faces, bodies or [("body", vertices.shape[1])]):
+    bodies = bodies or [("body", vertices.shape[1])]
+    names = mesh_names(bodies, len(obstacles))
+    for name, (own, faces_of) in zip(names, parts_of(faces, bodies), strict=False):
         part = vertices[:, own]
         indices = add(np.asarray(faces_of, "<u4").ravel(), "SCALAR", _FACES)
         attributes = {"POSITION": add(part[0], "VEC3", _VERTICES, bounds=True)}
@@ -89,27 +91,26 @@ def write_glb(
     }
     if frames == 1:
         del content["animations"]
-    for k, obstacle in enumerate(obstacles, 1):
+    for k, (name, obstacle) in enumerate(zip(names[len(bodies) :], obstacles, strict=True), 1):
         corners = {"POSITION": add(np.asarray(obstacle.vertices, "<f4"), "VEC3", _VERTICES, bounds=True)}
         triangles = add(np.asarray(obstacle.faces, "<u4").ravel(), "SCALAR", _FACES)
         look = {"baseColorFactor": [*linear(obstacle.color), obstacle.opacity]}
         content["materials"].append({"pbrMetallicRoughness": look | _ROUGH, "doubleSided": True})
         part = {"attributes": corners, "indices": triangles, "material": k}
-        content["meshes"].append({"name": f"obstacle {k}", "primitives": [part]})
+        content["meshes"].append({"name": name, "primitives": [part]})
         turns = Rotation.from_matrix(obstacle.poses[:, :3, :3]).as_quat(canonical=True)
         turns[1:] *= np.cumprod(np.where((turns[1:] * turns[:-1]).sum(1, keepdims=True) < 0, -1, 1), axis=0)
         motion = {"translation": obstacle.poses[:, :3, 3], "rotation": turns}
-        start = {name: values[0].tolist() for name, values in motion.items()}
+        start = {key: values[0].tolist() for key, values in motion.items()}
         node = len(content["nodes"])
-        content["nodes"].append({"mesh": node, "name": f"obstacle {k}", **start})
+        content["nodes"].append({"mesh": node, "name": name, **start})
         content["scenes"][0]["nodes"].append(node)
-        for name, values in motion.items() if obstacle.moves else ():
+        for key, values in motion.items() if obstacle.moves else ():
             moved = content["animations"][0]
-            kind = "VEC3" if name == "translation" else "VEC4"
+            kind = "VEC3" if key == "translation" else "VEC4"
             output = add(np.asarray(values, "<f4"), kind)
-            moved["channels"].append(
-                {"sampler": len(moved["samplers"]), "target": {"node": node, "path": name}}
-            )
+            target = {"node": node, "path": key}
+            moved["channels"].append({"sampler": len(moved["samplers"]), "target": target})
             moved["samplers"].append(animated | {"output": output})
     content["buffers"][0]["byteLength"] = len(body)
     text = json.dumps(content, separators=(",", ":")).encode()
@@ -121,12 +122,24 @@ def write_glb(
         partial.write_bytes(struct.pack("<4sII", b"glTF", 2, size) + b"".join(map(bytes, parts)))
 
 
-def parts_of(faces: np.ndarray, bodies: Sequence[tuple[str, int]]) -> Iterator[tuple[str, slice, np.ndarray]]:
-    """Name, vertices and faces (M_k, 3) of each body of a surface, counted from its first vertex."""
+def mesh_names(
+    bodies: Sequence[tuple[str, int]], obstacles: int, valid: Callable[[str], str] = str
+) -> list[str]:
+    """Different names of the meshes of bodies and then of obstacles, of which an equal one gets its number."""
+    names: list[str] = []
+    for name in map(valid, (*(name for name, _ in bodies), *(f"obstacle {k + 1}" for k in range(obstacles)))):
+        while name in names:
+            name = f"{name}_{len(names) + 1}"
+        names.append(name)
+    return names
+
+
+def parts_of(faces: np.ndarray, bodies: Sequence[tuple[str, int]]) -> Iterator[tuple[slice, np.ndarray]]:
+    """Vertices and faces (M_k, 3) of each body of a surface, counted from its first vertex."""
     first, faces = 0, np.asarray(faces)
-    for name, count in bodies:
+    for _, count in bodies:
         own = slice(first, first + count)
-        yield name, own, faces[(faces[:, 0] >= own.start) & (faces[:, 0] < own.stop)] - first
+        yield own, faces[(faces[:, 0] >= own.start) & (faces[:, 0] < own.stop)] - first
         first = own.stop
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from neuma_lib.extras import require
 from neuma_lib.geometry.obstacles import Obstacle
 from neuma_lib.io.files import atomic
-from neuma_lib.io.gltf import linear, parts_of
+from neuma_lib.io.gltf import linear, mesh_names, parts_of
 
 CODES_A_SECOND = 24.0
 """USD time codes per second; frames may have fractional codes."""
@@ -27,7 +27,7 @@ def write_usd(
 ) -> None:
     """Write a moving surface, y up, in metres; arguments as for `write_glb`. The suffix sets the format: usda, usdc.
 
-    Characters of names that USD does not allow become underscores. Equal names get the number of the body.
+    Characters of names that USD does not allow become underscores.
 
     Raises:
         InputError: usd-core is missing.
@@ -56,12 +56,10 @@ def write_usd(
             mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.asarray(triangles, np.int32).ravel()))
             return mesh
 
-        for k, (name, own, faces_of) in enumerate(
-            parts_of(faces, bodies or [("surface", vertices.shape[1])]), 1
-        ):
-            name = Tf.MakeValidIdentifier(name)
-            taken = stage.GetPrimAtPath(f"/body/{name}").IsValid()
-            mesh = define(f"{name}_{k}" if taken else name, faces_of)
+        bodies = bodies or [("surface", vertices.shape[1])]
+        names = mesh_names(bodies, len(obstacles), Tf.MakeValidIdentifier)
+        for name, (own, faces_of) in zip(names, parts_of(faces, bodies), strict=False):
+            mesh = define(name, faces_of)
             points, extent = mesh.CreatePointsAttr(), mesh.CreateExtentAttr()
             for code, frame in zip(codes, np.ascontiguousarray(vertices[:, own], np.float32), strict=True):
                 points.Set(Vt.Vec3fArray.FromNumpy(frame), float(code))
@@ -69,8 +67,8 @@ def write_usd(
                 extent.Set(Vt.Vec3fArray(ends), float(code))
             display_color = mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
             display_color.Set(Vt.Vec3fArray.FromNumpy(linear(colors[own]).astype(np.float32)))
-        for k, obstacle in enumerate(obstacles, 1):
-            mesh = define(f"obstacle_{k}", obstacle.faces)
+        for name, obstacle in zip(names[len(bodies) :], obstacles, strict=True):
+            mesh = define(name, obstacle.faces)
             corners = np.ascontiguousarray(obstacle.vertices, np.float32)
             mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(corners))
             ends = [Gf.Vec3f(*end.tolist()) for end in (corners.min(axis=0), corners.max(axis=0))]

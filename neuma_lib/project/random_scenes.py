@@ -18,7 +18,7 @@ from neuma_lib.config.base import Section, Seed, Vector, internal, no_boolean
 from neuma_lib.config.dataset import CONVERGED
 from neuma_lib.config.laws import LawConfig
 from neuma_lib.errors import InputError
-from neuma_lib.mechanics.catalogue import viscous_stiffness
+from neuma_lib.mechanics.catalogue import stiffest, viscous_stiffness
 
 Item = TypeVar("Item")
 
@@ -108,13 +108,15 @@ class FamilyConfig(Section):
     )
     plasticity: DrawnPart = Field(DrawnPart(name="identity"), description="the same of the return map")
     viscosity: DrawnPart | None = Field(None, description="the same of the viscous part; null: none")
+    field: DrawnPart | None = Field(
+        None, description="the same of a stiffness that changes along x; null: none"
+    )
 
     @property
     def parts(self) -> dict[str, DrawnPart]:
         """Given parts of the law, in the order in which they are drawn."""
-        return {
-            key: part for key in ("elasticity", "plasticity", "viscosity") if (part := getattr(self, key))
-        }
+        names = ("elasticity", "plasticity", "viscosity", "field")
+        return {key: part for key in names if (part := getattr(self, key))}
 
     @model_validator(mode="after")
     def _has_a_wave_speed(self) -> Self:
@@ -330,10 +332,15 @@ def largest_stable(settings: RandomConfig, laws: Sequence[Mapping], grid: int) -
 
     def courant(dt: float) -> float:
         moduli = [  # including fibres and viscous parts
-            part["E"] * (1 - part["nu"]) / ((1 + part["nu"]) * (1 - 2 * part["nu"]))
-            + part.get("fibre_modulus", 0.0)
-            + (viscous_stiffness({**viscosity, "dt": dt}) if viscosity else 0.0)
-            for part, viscosity in ((law["elasticity"], law.get("viscosity")) for law in laws)
+            stiffest(field)
+            * (
+                part["E"] * (1 - part["nu"]) / ((1 + part["nu"]) * (1 - 2 * part["nu"]))
+                + part.get("fibre_modulus", 0.0)
+                + (viscous_stiffness({**viscosity, "dt": dt}) if viscosity else 0.0)
+            )
+            for part, viscosity, field in (
+                (law["elasticity"], law.get("viscosity"), law.get("field")) for law in laws
+            )
             if {"E", "nu"} <= set(part)
         ]
         return math.sqrt(max(moduli) / DENSITY) * dt * grid

@@ -68,7 +68,7 @@ def view(
         return
     chosen = choose_device(device)
     torch.set_num_threads(1)  # two OpenMP threads next to the server's are slower than one
-    laws = find_laws(settings, files.name)
+    laws = {} if scene.bodies else find_laws(settings, files.name)  # live, a scene has one body at first
     playground = Playground(files, laws, first_law(files, laws), chosen) if laws else None
     server = ViewerServer(scene, playground, host, port)
     counts = f"{len(scene.motions)} motions, {len(laws)} laws"

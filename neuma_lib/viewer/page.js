@@ -312,10 +312,12 @@ function drawSplats(camera, motion, other) {
 
 function drawBalls(camera, motion, name) {
   const entry = motion.x.entry, rows = new Float32Array(7 * entry.count), known = motion.scalars[name];
+  const map = name === "body" ? null : meta.quantities[name].map;
   motion.x.into(state.frame, rows, 7, 0);
-  const values = known && known.values, from = state.frame * entry.count, map = meta.quantities[name].map;
+  const values = known && known.values, from = state.frame * entry.count;
   for (let k = 0; k < entry.count; k++) {
-    if (values) mapped(map, values[from + k] / 255, rows, 7 * k + 3);
+    if (values && !map) rows.set(meta.bodies[values[from + k]].color, 7 * k + 3);
+    else if (values) mapped(map, values[from + k] / 255, rows, 7 * k + 3);
     else rows.fill(0.7, 7 * k + 3, 7 * k + 6);
     rows[7 * k + 6] = 1;
   }
@@ -346,6 +348,31 @@ function drawObstacles(camera) {
     }
     drawPlain("lines", camera, rows, [["mean", 3], ["colour", 4]], gl.TRIANGLES);
   }
+}
+
+// Names of several bodies above their particles.
+function nameBodies(camera, motion, left) {
+  if (!motion.scalars.body) return;
+  const x = motion.x.frame(state.frame), owner = motion.scalars.body.values, ratio = window.devicePixelRatio || 1;
+  meta.bodies.forEach(({ name, color }, body) => {
+    const top = [0, -Infinity, 0];
+    let count = 0;
+    for (let k = 0; k < x.length / 3; k++) {
+      if (owner[k] !== body) continue;
+      count++;
+      top[0] += x[3 * k];
+      top[1] = Math.max(top[1], x[3 * k + 1]);
+      top[2] += x[3 * k + 2];
+    }
+    const p = product(camera.R, [top[0] / count, top[1], top[2] / count]).map((u, i) => u + camera.t[i]);
+    if (!(p[2] > NEAR)) return;
+    const span = document.createElement("span"), at = [0, 1].map((i) => camera.focal[i] * p[i] / p[2] + camera.centre[i]);
+    span.textContent = name;
+    span.style.left = `${(at[0] + left) / ratio}px`;
+    span.style.top = `${at[1] / ratio}px`;
+    span.style.borderColor = `rgb(${color.map((part) => Math.round(255 * part))})`;
+    byId("names").append(span);
+  });
 }
 
 const DEPTH_OF_FRUSTUM = 0.16;
@@ -427,12 +454,14 @@ function drawPanel(motion, other, what, place) {
   if (what === "seen" || what === "distance") {
     if (motion.means) drawSplats(camera, motion, what === "distance" && other && other.means ? other : null);
   } else drawBalls(camera, motion, what);
+  nameBodies(camera, motion, x);
 }
 
 function draw() {
   const ratio = window.devicePixelRatio || 1, { left, right, what } = shown();
   const width = Math.max(2, Math.round(canvas.clientWidth * ratio)), height = Math.max(2, Math.round(canvas.clientHeight * ratio));
   if (canvas.width !== width || canvas.height !== height) { canvas.width = width; canvas.height = height; }
+  byId("names").replaceChildren();
   gl.enable(gl.SCISSOR_TEST);
   gl.enable(gl.DEPTH_TEST);
   gl.scissor(0, 0, width, height);
@@ -513,6 +542,7 @@ function controls() {
   motions.forEach((motion, i) => { option(byId("right"), i, motion.title); });
   option(byId("show"), "seen", "Gaussians");
   option(byId("show"), "distance", "Gaussians by distance of both");
+  if (meta.bodies.length) option(byId("show"), "body", "particles by body");
   for (const [name, { label }] of Object.entries(meta.quantities)) option(byId("show"), name, `particles by ${label}`);
   option(byId("camera"), "", "free");
   meta.views.forEach((view, i) => option(byId("camera"), i, `view ${view.number}`));

@@ -24,7 +24,7 @@ from neuma_lib.extras import require
 from neuma_lib.geometry.obstacles import Obstacle, obstacles
 from neuma_lib.io.files import write_text
 from neuma_lib.viewer.scalars import QUANTITIES
-from neuma_lib.viewer.scene import Log, Motion, Scene, View, frame_at
+from neuma_lib.viewer.scene import BODY_COLOURS, Log, Motion, Scene, View, frame_at
 
 COLOURS = {None: "viridis", 1.0: "coolwarm"}
 """Centre of a quantity's range -> colour map."""
@@ -162,6 +162,9 @@ def _filled(scene: Scene, steps: tuple[int, ...], particles: int, limits: list[s
             }
             for name, quantity in known.items()
         },
+        "bodies": [
+            {"name": name, "color": color} for name, color in zip(scene.bodies, BODY_COLOURS, strict=False)
+        ],
         "maps": {name: colour_map(name) for name in COLOURS.values()},
         "notes": list(scene.notes),
         "limits": limits,
@@ -195,7 +198,9 @@ def _motion(scene: Scene, motion: Motion, steps: tuple[int, ...], particles: int
         "radius": radius,
         "x": blob.frames(x.transpose(1, 2).numpy()),
         "scalars": {
-            name: blob.frames(values[at, ::stride][:, None].numpy(), bits=8, ends=scene.ranges[name])
+            name: blob.frames(
+                values[at, ::stride][:, None].numpy(), bits=8, ends=scene.ranges.get(name, (0, 255))
+            )
             for name, values in motion.scalars.items()
         },
     }

@@ -27,11 +27,11 @@ from neuma_lib.sim.rollout import rollout
 from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.viewer import scalars
 from neuma_lib.viewer.live import LiveSimulation, Snapshot
+from neuma_lib.viewer.scene import BODY_COLOURS
 
 ADDED_SIZE = 0.22
 """Longest side of an added solid [m]."""
 ADDED_PARTICLES = 500
-_COLOURS = ((0.23, 0.49, 0.77), (0.84, 0.27, 0.24), (0.94, 0.75, 0.25), (0.35, 0.65, 0.38))
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ class Playground:
         mesh = place(shape, ADDED_SIZE, 0.5, (0.5, 0.5), resolution=48)
         x0 = torch.from_numpy(sample_volume(mesh, ADDED_PARTICLES)).float()
         with self._changing:
-            colour = torch.tensor(_COLOURS[(len(self._bodies) - 1) % len(_COLOURS)])
+            colour = torch.tensor(BODY_COLOURS[len(self._bodies) % len(BODY_COLOURS)])
             body = coloured_solid(mesh, x0, self._density, colour.expand(len(x0), 3))
             self._bodies.append(body)
             self.names.append(shape)
@@ -157,7 +157,9 @@ class Playground:
         return Picture(snapshot, means[0], covars[0], g)
 
     def values(self, snapshot: Snapshot, name: str) -> Tensor:
-        """A quantity of `scalars.QUANTITIES` for all particles; stresses by the law of the first body."""
+        """A quantity of `Motion.scalars` for all particles; stresses by the law of the first body."""
+        if name == "body":
+            return torch.arange(len(snapshot.counts)).repeat_interleave(torch.tensor(snapshot.counts))
         if name == "speed":
             return snapshot.v.norm(dim=-1)
         if name == "plastic_strain":

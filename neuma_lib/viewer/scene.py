@@ -1,4 +1,4 @@
-"""Data of a viewer: Gaussians and particles of several motions of one body, cameras and their images."""
+"""Data of a viewer: Gaussians and particles of several motions of a scene, cameras and their images."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from neuma_lib.coupling.binding import Binding
 from neuma_lib.coupling.deformation import arms_at_rest, deform
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError
-from neuma_lib.io.files import one_line, parse_json
+from neuma_lib.io.files import one_line, parse_json, read_json
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.images import read_image_set, read_transforms
 from neuma_lib.io.particles import load_reconstruction
@@ -29,6 +29,10 @@ from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.viewer import scalars
 
 TRUTH = "truth"
+BODY_COLOURS = (
+    (0.90, 0.62, 0.0), (0.34, 0.71, 0.91), (0.0, 0.62, 0.45), (0.80, 0.47, 0.65), (0.0, 0.45, 0.70),
+)  # fmt: skip
+"""RGB of the bodies in their order, those of Okabe and Ito (2008)."""
 _BOUND = 8
 """Number of true particles bound to a Gaussian of the reconstruction."""
 
@@ -44,7 +48,8 @@ class Motion:
         title: display name.
         steps: simulation step of each frame, length T.
         x: particles [m], shape (T, N, 3).
-        scalars: name in `scalars.QUANTITIES` -> values of particles, shape (T, N); without unknown ones.
+        scalars: name in `scalars.QUANTITIES` -> values of particles, shape (T, N); without unknown ones. With several
+            bodies also ``body``: indices of the bodies.
         means, covars: Gaussians [m], [m^2], shapes (T, G, 3) and (T, G, 3, 3); None if none are bound to the particles.
     """
 
@@ -86,6 +91,7 @@ class Scene:
         ranges: legend ranges by name, see `scalars.ranges`.
         notes: messages on missing content.
         colliders: obstacles.
+        bodies: names of several bodies; (): one body.
     """
 
     name: str
@@ -97,6 +103,7 @@ class Scene:
     ranges: dict[str, tuple[float, float]]
     notes: tuple[str, ...]
     colliders: tuple[Collider, ...] = ()
+    bodies: tuple[str, ...] = ()
 
     @property
     def steps(self) -> tuple[int, ...]:
@@ -125,13 +132,17 @@ def load_scene(
     """
     paths = [files.checked(path) for path in (files.particles, files.binding, files.gaussians)]
     body, dt = load_reconstruction(*paths, files.density), files.simulation["dt"]
+    listed = read_json(files.checked(files.velocity)).get("bodies", ()) if files.velocity else ()
+    bodies = tuple(each.get("name", each["scene"]) for each in listed)
+    counts = torch.tensor([each["particles"] for each in listed], dtype=torch.int64)
+    owners = torch.arange(len(bodies)).repeat_interleave(counts)
     motions, notes = [], []
     if files.truth:
         motions.append(true_motion(files.checked(files.truth), body, dt))
     for run in files.runs:
         log(f"{run.title}: {run.rollout}")
         try:
-            motions.append(_predicted(files, run, body, notes))
+            motions.append(_predicted(files, run, body, owners, notes))
         except InputError as error:
             if not skip_damaged:
                 raise
@@ -153,7 +164,7 @@ def load_scene(
     bounds, volume = scalars.ranges(motion.scalars for motion in motions), float(body.vol0.sum())
     colliders = with_obstacles(files.simulation).get("colliders", ())
     return Scene(
-        files.name, dt, body.gaussians, volume, tuple(motions), views, bounds, tuple(notes), colliders
+        files.name, dt, body.gaussians, volume, tuple(motions), views, bounds, tuple(notes), colliders, bodies
     )
 
 
@@ -162,7 +173,7 @@ def true_motion(path: Path, body: Reconstruction, dt: float) -> Motion:
 
     Each Gaussian follows the affine motion of the `_BOUND` true particles that are nearest to it at the start.
     """
-    names = ("x", "F", "v", "frames")
+    names = ("x", "F", "v", "frames", "body")
     arrays, attributes = read_arrays(path, required=("x", "F"), only=names)
     law = None
     if "bodies" in attributes:
@@ -177,6 +188,8 @@ def true_motion(path: Path, body: Reconstruction, dt: float) -> Motion:
     binding = nearest_binding(g.means, x[0])
     moved = deform(g.means, g.covars(), binding, x[0], x, F, arms=arms_at_rest(g.means, binding, x[0]))
     values = _values(x, F, None, v, steps, dt, law)
+    if "body" in arrays:
+        values["body"] = torch.from_numpy(arrays["body"]).expand(len(x), -1)
     return Motion(TRUTH, "Truth", steps, x, values, *moved)
 
 
@@ -197,8 +210,10 @@ def nearest_binding(means: Tensor, x: Tensor) -> Binding:
     )
 
 
-def _predicted(files: SceneFiles, run: RunFiles, body: Reconstruction, notes: list[str]) -> Motion:
-    """A method's motion on the reconstructed body."""
+def _predicted(
+    files: SceneFiles, run: RunFiles, body: Reconstruction, owners: Tensor, notes: list[str]
+) -> Motion:
+    """A method's motion on the reconstructed body, or bodies to which the particles belong (N,)."""
     path = files.checked(run.rollout)
     arrays, attributes = read_arrays(path, required=("x", "F"), only=("x", "F", "F_total", "frames"))
     x, F = (torch.from_numpy(arrays[name]) for name in ("x", "F"))
@@ -226,9 +241,10 @@ def _predicted(files: SceneFiles, run: RunFiles, body: Reconstruction, notes: li
         notes.append(f"{run.title}: its own particles, which carry no Gaussians")
     # a law with another time step has other steps; the slider shows those of the scene
     scene_steps = tuple(round(step * dt / files.simulation["dt"]) for step in steps)
-    return Motion(
-        run.name, run.title, scene_steps, x, _values(x, F, total, None, steps, dt, law), means, covars
-    )
+    values = _values(x, F, total, None, steps, dt, law)
+    if x.shape[1] == len(owners):
+        values["body"] = owners.expand(len(x), -1)
+    return Motion(run.name, run.title, scene_steps, x, values, means, covars)
 
 
 def _values(

@@ -24,11 +24,13 @@ from neuma_lib.viewer.live import EARTH, MAX_SPEED, PIVOT, Snapshot
 from neuma_lib.viewer.page import COLOURS
 from neuma_lib.viewer.playground import Picture, Playground
 from neuma_lib.viewer.scalars import QUANTITIES, rounded_up
-from neuma_lib.viewer.scene import Motion, Scene, frame_at
+from neuma_lib.viewer.scene import BODY_COLOURS, Motion, Scene, frame_at
 
 RECORDED, LIVE = "recorded", "live"
 NOTHING, SEEN, DISTANCE = "nothing", "Gaussians", "Gaussians by distance of both"
-BY_QUANTITY = {f"particles by {quantity.label}": name for name, quantity in QUANTITIES.items()}
+BY_QUANTITY = {"particles by body": "body"} | {
+    f"particles by {quantity.label}": name for name, quantity in QUANTITIES.items()
+}
 """Entry of the list "show" -> name of the quantity."""
 OFFSET = 1.15
 """Offset of the second box from the first [m]."""
@@ -325,7 +327,10 @@ class ViewerServer:
         self._turn(np.eye(3))
         with self.server.atomic():
             self._move_obstacles(self.scene.dt * step)
-            self._label_bodies(())
+            named_bodies = self.scene.bodies if left and "body" in left.scalars else ()
+            self._label_bodies(named_bodies, [
+                left.x[frame_at(left.steps, step), left.scalars["body"][0] == k] for k in range(len(named_bodies))
+            ])  # fmt: skip
             pair = display == DISTANCE
             self._draw_motion("left", left, step, display, right, text)
             if right and not pair:
@@ -363,7 +368,7 @@ class ViewerServer:
             return self._splats(side, motion.means[frame], motion.covars[frame], rgb, g.opacities)
         known = motion.scalars.get(name)
         if known is None:
-            text.append(f"{motion.title}: {QUANTITIES[name].label} is not known")
+            text.append(f"{motion.title}: {display.removeprefix('particles by ')} is not known")
         self._points(side, motion.x[frame], None if known is None else known[frame], name)
 
     def _draw_live(self) -> None:
@@ -385,15 +390,15 @@ class ViewerServer:
             else:
                 self._points("left", snapshot.x, play.values(snapshot, name), name)
             self._handle.position = snapshot.x[: snapshot.counts[0]].mean(dim=0).numpy()
-            self._label_bodies(snapshot.x.split(snapshot.counts))
+            self._label_bodies(play.names, snapshot.x.split(snapshot.counts))
         now, trouble = time.perf_counter(), (snapshot.trouble, snapshot.notice, self._message)
         if now - self._text_time > _TEXT_TIME or trouble != self._trouble:
             self._text_time, self._trouble = now, trouble
             self._set_status(self._live_text(snapshot))
 
-    def _label_bodies(self, bodies: Sequence[torch.Tensor]) -> None:
+    def _label_bodies(self, names: Sequence[str], bodies: Sequence[torch.Tensor]) -> None:
         """Number and name above the particles (N, 3) of each of several bodies."""
-        texts = [f"{k + 1} {name}" for k, name in enumerate(self.playground.names)] if len(bodies) > 1 else []
+        texts = [f"{k + 1} {name}" for k, name in enumerate(names)] if len(bodies) > 1 else []
         for k in range(len(self._labels), len(texts)):
             self._labels.append(
                 self.server.scene.add_label(f"/left/box/label_{k}", "", anchor="bottom-center")
@@ -450,12 +455,16 @@ class ViewerServer:
         self._only(side, "splats")
 
     def _points(self, side: str, x: torch.Tensor, values: torch.Tensor | None, name: str) -> None:
-        quantity = QUANTITIES[name]
-        low, high = self.scene.ranges.get(name, (0.0, quantity.min_range))
         rgb = np.full((len(x), 3), 0.7)
-        if values is not None:
-            rgb = colours(COLOURS[quantity.middle], ((values - low) / (high - low)).numpy())
-        self._show_legend(COLOURS[quantity.middle], quantity.label, low, high, quantity.unit)
+        if quantity := QUANTITIES.get(name):
+            low, high = self.scene.ranges.get(name, (0.0, quantity.min_range))
+            if values is not None:
+                rgb = colours(COLOURS[quantity.middle], ((values - low) / (high - low)).numpy())
+            self._show_legend(COLOURS[quantity.middle], quantity.label, low, high, quantity.unit)
+        else:
+            self._hide_legend()
+            if values is not None:
+                rgb = np.array(BODY_COLOURS)[values.numpy() % len(BODY_COLOURS)]
         size = (self.scene.volume / len(x)) ** (1 / 3)
         bytes_ = (255 * rgb).astype(np.uint8)
         node = self._nodes.get((side, "points"))

@@ -101,6 +101,21 @@ def test_bodies_of_a_surface_are_meshes_of_usd_with_their_names(tmp_path):
         assert own.is_watertight and own.volume == pytest.approx(solid.volume)
 
 
+def test_a_body_named_as_an_obstacle_keeps_its_name(tmp_path, surface, around):
+    """Three meshes of both formats have three names, and the body has its own."""
+    pytest.importorskip("pxr")
+    from pxr import Usd
+
+    count = surface[0].shape[1]
+    write_glb(tmp_path / "a.glb", *surface, around, [("obstacle 1", count)])
+    sizes = {name: len(part.vertices) for name, part in trimesh.load(tmp_path / "a.glb").geometry.items()}
+    assert len(sizes) == 3 and sizes["obstacle 1"] == count and "obstacle 2" in sizes
+    write_usd(tmp_path / "a.usda", *surface, around, [("obstacle_1", count)])
+    stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
+    parts = [part.GetName() for part in stage.GetDefaultPrim().GetChildren()]
+    assert parts == ["obstacle_1", "obstacle_1_2", "obstacle_2"]
+
+
 def test_scales_and_rotations_make_the_covariances_again():
     g = ball(500).to(dtype=torch.float64)
     flat = dataclasses.replace(g, scales=g.scales * torch.tensor([1.0, 0.1, 1e-4]))

@@ -114,20 +114,24 @@ def test_materials_outside_the_families_are_drawn_on_request(loaded):
     assert not {*random.families} & {*random.outside}
 
 
-def test_solids_with_a_viscous_part_are_drawn(raw):
+@pytest.mark.parametrize(
+    ("study", "part", "names"),
+    [("viscous_solids", "viscosity", ("kelvin_voigt", "maxwell")), ("fields", "field", ("ramp", "halves"))],
+)
+def test_solids_with_another_part_are_drawn(raw, study, part, names):
     """They are stable, within their ranges, and among the candidates."""
-    study = loading.read_yaml(ROOT / "config/studies/viscous_solids.yaml")
+    study = loading.read_yaml(ROOT / f"config/studies/{study}.yaml")
     settings = loading.load(loading.merged(raw, study), ROOT)
     assert settings.random.is_development
     drawn = {settings.random.family(name): settings.scenes[name] for name in settings.random_scenes}
-    for name in ("kelvin_voigt", "maxwell"):
+    for name in names:
         scene, law = drawn[name], drawn[name].law.plain()
-        constants, ranges = law["viscosity"], settings.random.families[name].viscosity.ranges
+        constants, ranges = law[part], getattr(settings.random.families[name], part).ranges
         assert constants["name"] == name and ranges.keys() == constants.keys() - {"name"}
         for key, (low, high) in ranges.items():
             assert low * 0.995 <= constants[key] <= high * 1.005
         assert MPM(grid=36, dt=scene.dt).courant(analytic_law(law, dt=scene.dt), DENSITY) <= 0.6 * (1 + 1e-3)
-        assert settings.identify.families[name].viscosity.name == name
+        assert getattr(settings.identify.families[name], part).name == name
 
 
 def test_the_calibration_has_every_kind_of_truth(raw):

@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from neuma_lib.io.files import write_json
+from neuma_lib.io.hdf5 import read_arrays, write_arrays
 from neuma_lib.project.find import find_laws, find_scene
 from neuma_lib.viewer.page import write_page
 from neuma_lib.viewer.playground import Playground, first_law
-from neuma_lib.viewer.scene import load_scene
+from neuma_lib.viewer.scene import BODY_COLOURS, load_scene
 from neuma_lib.viewer.server import LIVE, ViewerServer
 from tests.support.browser import opened
 from tests.support.viewer_project import SCENE, STEPS, make_project, make_splat
@@ -134,6 +136,37 @@ def test_the_file_of_a_splat_has_the_motion_of_its_law_alone_and_plays(tmp_path)
         assert page.locator("#left option").all_inner_texts() == [scene.motions[0].title]
         page.select_option("#show", "von_mises")
         assert page.is_visible("#legend")
+        assert not complaints
+
+
+def test_several_bodies_have_their_names_and_colours(tmp_path):
+    """The true bodies are the two halves of a block, the first on the right."""
+    place = make_project(tmp_path)
+    starts = [{"scene": SCENE, "name": name, "particles": n} for name, n in (("duck", 150), ("ball", 250))]
+    write_json(place / "velocity.json", {"bodies": starts})
+    truth = tmp_path / "data" / SCENE / "truth.h5"
+    arrays, attributes = read_arrays(truth)
+    write_arrays(truth, {**arrays, "body": np.int64(arrays["x"][0, :, 0] < 0.5)}, attributes)
+    scene = load_scene(find_scene(place)[1])
+    assert scene.bodies == ("duck", "ball")
+    assert [int(motion.scalars["body"].sum()) for motion in scene.motions[1:]] == [250 * len(STEPS)] * 2
+    write_page(tmp_path / "viewer.html", scene)
+    with opened((tmp_path / "viewer.html").as_uri()) as (page, complaints):
+        first_picture(page)
+        page.select_option("#right", "")
+        page.select_option("#camera", "0")
+        names = page.locator("#names span")
+        assert names.all_inner_texts() == ["duck", "ball"]
+        duck, ball = (names.nth(k).bounding_box() for k in range(2))
+        assert duck["x"] > ball["x"] + 10 and duck["y"] == pytest.approx(ball["y"], abs=10)
+        page.select_option("#show", "body")
+        drawn = picture(page)
+        for color, box in zip(BODY_COLOURS, (duck, ball), strict=False):
+            hue = drawn - drawn.mean(axis=-1, keepdims=True)
+            wanted = np.array(color) - np.mean(color)
+            alike = hue @ wanted > 0.98 * np.linalg.norm(hue, axis=-1) * np.linalg.norm(wanted) + 1e-9
+            columns = np.nonzero(alike & (np.abs(hue).max(axis=-1) > 30))[1]
+            assert len(columns) > 200 and columns.mean() == pytest.approx(box["x"] + box["width"] / 2, abs=30)
         assert not complaints
 
 

@@ -365,6 +365,9 @@ def test_bodies_of_the_same_shape_have_labels(served):
     assert reached(lambda: texts() == ["1 BouncyBall", "2 letter_I", "3 letter_I"])
     heights = [label.position[1] for label in served._labels]
     assert heights == sorted(heights)
+    served.gui["show"].value = "particles by body"
+    points = lambda: served._nodes.get(("left", "points"))  # noqa: E731
+    assert reached(lambda: points() and len(set(map(tuple, points().colors.tolist()))) == 3)
     play.reset()
     assert reached(lambda: texts() == [])
 

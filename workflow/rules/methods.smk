@@ -270,7 +270,8 @@ def own_result(file):
 def viewer_files(wildcards):
     """Files and settings of a scene for the viewer in a file."""
     methods = cases.moving_methods(SETTINGS, wildcards.scene, SETTINGS.viewer.methods)
-    return replace(scene_files(SETTINGS, wildcards.scene, methods), velocity=None)
+    files = scene_files(SETTINGS, wildcards.scene, methods)
+    return files if SETTINGS.scene(wildcards.scene).bodies else replace(files, velocity=None)
 
 
 def identify_threads(wildcards):
