@@ -11,8 +11,9 @@ because a calibration must not see what is reported.
 
 from __future__ import annotations
 
+import math
 import subprocess
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -25,14 +26,43 @@ from neuma_lib.evaluation.calibration import (
     FILE,
     LEVELS,
     QUANTITIES,
+    Quantiles,
     family_probabilities,
-    measured_quantiles,
 )
-from neuma_lib.evaluation.coverage import brier_score, fitted_temperature, mean_over_scenes
+from neuma_lib.evaluation.coverage import brier_score, mean_over_scenes
 from neuma_lib.io.files import read_json, write_json
 from neuma_lib.paper.calibration_table import TARGETS, errors_in_std
 
 FOLDS = 5
+TEMPERATURES = tuple(np.geomspace(0.01, 30, 81))
+"""Candidates of `fitted_temperature`."""
+
+
+def measured_quantiles(z: Sequence[float]) -> Quantiles:
+    """Quantiles of errors in estimated standard deviations, of which new ones are below with at least the probability.
+
+    At a level p it is the ceil(p (n + 1))-th smallest of n values, or the largest if there are too few (Lei et al.
+    2018, Theorem 2.1).
+    """
+    sizes, n = np.sort(np.abs(np.asarray(z, dtype=float))), len(z)
+    if n == 0:
+        raise InputError("errors", "there are none to measure quantiles of", "Give more scenes")
+    ranks = [min(n, math.ceil(round(level * (n + 1), 9))) for level in LEVELS]
+    return Quantiles(tuple(float(sizes[rank - 1]) for rank in ranks))
+
+
+def fitted_temperature(scenes: Sequence[tuple[Mapping, Set[str]]]) -> float:
+    """The temperature with the lowest mean Brier score.
+
+    Args:
+        scenes: content of identified.json, or its entries ``families`` and ``compared``, and the names of the true
+            family.
+    """
+    means = [
+        np.mean([brier_score(family_probabilities(known, each), right) for known, right in scenes])
+        for each in TEMPERATURES
+    ]
+    return float(TEMPERATURES[int(np.argmin(means))])
 
 
 def errors_by_quantity(scenes: Sequence[Mapping[str, Any]]) -> dict[str, list[np.ndarray]]:

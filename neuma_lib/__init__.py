@@ -3,8 +3,6 @@
 Public names are loaded on first use, so that ``import neuma_lib`` is fast and loads no torch.
 """
 
-from __future__ import annotations
-
 import importlib
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +17,7 @@ if TYPE_CHECKING:
         evaluate,
         identify,
         render,
-    )
+    )  # fmt: skip
     from neuma_lib.coupling.initial_motion import InitialMotion
     from neuma_lib.coupling.reconstruction import Reconstruction
     from neuma_lib.errors import InputError, NonFiniteError
@@ -35,33 +33,10 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
-    "Adaptation",
-    "Elasticity",
-    "Identification",
-    "InitialMotion",
-    "InputError",
-    "Law",
-    "METHODS",
-    "MPM",
-    "Method",
-    "NonFiniteError",
-    "Pair",
-    "Plasticity",
-    "Reconstruction",
-    "Scene",
-    "State",
-    "Trajectory",
-    "Video",
-    "__version__",
-    "adapt",
-    "estimate_motion",
-    "evaluate",
-    "identify",
-    "render",
-    "rollout",
-    "simulate",
-    "view",
-]
+    "Adaptation", "Elasticity", "Identification", "InitialMotion", "InputError", "Law", "METHODS", "MPM", "Method",
+    "NonFiniteError", "Pair", "Plasticity", "Reconstruction", "Scene", "State", "Trajectory", "Video",
+    "__version__", "adapt", "estimate_motion", "evaluate", "identify", "render", "rollout", "simulate", "view",
+]  # fmt: skip
 
 _PUBLIC = {
     "api": "Adaptation Identification Scene Video adapt estimate_motion evaluate identify render",

@@ -1,7 +1,5 @@
 """The command ``neuma``, also ``python -m neuma_lib``."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Sequence

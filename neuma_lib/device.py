@@ -5,8 +5,6 @@ the user. The workflow sets it to a folder of the project, which one job fills, 
 kernels.
 """
 
-from __future__ import annotations
-
 import inspect
 import os
 import re
@@ -25,11 +23,7 @@ from neuma_lib.errors import InputError
 
 
 def choose_device(name: str = "auto") -> torch.device:
-    """The device of a name; "auto" is CUDA if it is available.
-
-    Raises:
-        InputError: torch finds no CUDA device.
-    """
+    """The device of a name; "auto" is CUDA if it is available. Raises InputError: torch finds no CUDA device."""
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
     if name.startswith("cuda") and not torch.cuda.is_available():
@@ -130,7 +124,6 @@ def sort_pairs(keys: torch.Tensor, values: torch.Tensor, count: int, bits: int =
     Args:
         keys: float32 or int32, shape (2 count,), not negative; the second half is scratch.
         values: int32, of the same shape.
-        count: number of pairs.
         bits: number of lowest bits that may be set in keys.
     """
     with wp.ScopedStream(warp_stream(keys.device), sync_enter=False):

@@ -1,7 +1,5 @@
 """The errors that users meet: `InputError` for an input to correct, `NonFiniteError` for a diverged computation."""
 
-from __future__ import annotations
-
 from os import PathLike
 
 

@@ -1,7 +1,5 @@
 """Own methods and laws: Python files that the setting `extensions` names, and entry points of installed packages."""
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 import sys
@@ -13,8 +11,7 @@ from types import ModuleType
 
 from neuma_lib.errors import InputError
 
-LAW_GROUP, METHOD_GROUP = "neuma.laws", "neuma.methods"
-"""Groups of entry points."""
+LAW_GROUP, METHOD_GROUP = "neuma.laws", "neuma.methods"  # groups of entry points
 
 
 def load_module(name: str) -> ModuleType:

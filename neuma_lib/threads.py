@@ -3,8 +3,6 @@
 One thread does a piece from start to end, so results do not depend on the number of threads.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar

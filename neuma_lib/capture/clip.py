@@ -47,23 +47,14 @@ _PLANE = (np.zeros(3), np.array([0.0, 0.0, 1.0]))
 
 @dataclass(frozen=True, eq=False)
 class ClipFlight:
-    """One free flight in a clip.
+    """One free flight in a clip."""
 
-    Attributes:
-        frames: numbers of the first and last frame of the fit.
-        times: of the fit [s], (T,).
-        places: positions of the centre [px], (T, 2).
-        width: of the object across its longer axis [px], and its standard deviation.
-        fall: in metres, y up, x to the right, in the plane z = 0.
-        spin: None if the object has too little texture.
-    """
-
-    frames: tuple[int, int]
-    times: np.ndarray
-    places: np.ndarray
-    width: tuple[float, float]
-    fall: FreeFall
-    spin: Spin | None
+    frames: tuple[int, int]  # numbers of the first and last frame of the fit
+    times: np.ndarray  # of the fit [s], (T,)
+    places: np.ndarray  # positions of the centre [px], (T, 2)
+    width: tuple[float, float]  # of the object across its longer axis [px], and its standard deviation
+    fall: FreeFall  # in metres, y up, x to the right, in the plane z = 0
+    spin: Spin | None  # None if the object has too little texture
 
     def report(self, diameter: float | None) -> dict[str, Any]:
         """JSON report. Without a known diameter, lengths are in diameters of an object that falls with gravity."""

@@ -29,10 +29,8 @@ from neuma_lib.io.files import existing, one_line
 from neuma_lib.io.images import MAX_PIXELS
 from neuma_lib.io.processes import start_child
 
-MAX_FRAMES = 100_000
-"""Frames of a video that are accepted: a quarter of an hour at 120 per second."""
-STEADY = 0.1
-"""Relative variation of the frame interval below which the rate is considered constant."""
+MAX_FRAMES = 100_000  # frames of a video that are accepted: a quarter of an hour at 120 per second
+STEADY = 0.1  # relative variation of the frame interval below which the rate is considered constant
 _REPEATED = 0.3  # change of a repeated picture relative to those before and after it
 _MIN_PERIODIC, _PERIODIC = 5, 0.6  # repeats, and share of them, that determine a period
 _MAX_REPEATS = 4  # of one picture
@@ -45,19 +43,14 @@ _NOTED_RATE = re.compile(
 
 @dataclass(frozen=True, eq=False)
 class Timeline:
-    """Capture times of the frames of a video.
+    """Capture times of the frames of a video."""
 
-    Attributes:
-        times: ascending, the first as in the file (sound and picture share the clock), (N,) [s].
-        width, height: of the upright picture [px].
-        stretch: divisor of the file's times: 8 if 240 frames per second are stored as 30.
-        repeated: numbers of the frames that show the picture of the previous frame again, (R,).
-    """
-
-    times: np.ndarray
+    times: np.ndarray  # ascending, the first as in the file (sound and picture share the clock), (N,) [s]
+    # width, height: of the upright picture [px]
     width: int
     height: int
-    stretch: float
+    stretch: float  # divisor of the file's times: 8 if 240 frames per second are stored as 30
+    # numbers of the frames that show the picture of the previous frame again, (R,)
     repeated: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
 
     @property

@@ -19,8 +19,7 @@ MIN_MEAN_IOU = 0.7
 16 real photographs of a plush figure, of which 5 masks contain bedclothes or lack a part, have 0.78."""
 BELOW_FLOOR, ABOVE_FLOOR = 0.1, 0.15
 """Distance of the lowest part of a body below and above the floor, relative to its height."""
-VOLUME_RATIO = (0.6, 1.25)
-"""Range of the volume of the surface relative to the visual hull on the floor."""
+VOLUME_RATIO = (0.6, 1.25)  # range of the volume of the surface relative to the visual hull on the floor
 _QUANTILE = 0.01  # of the heights, to which single stray Gaussians do not matter
 _OWN_MASKS = (
     "select the object with a box (`object` in capture.yaml), or put masks of the object alone into the folder"

@@ -24,13 +24,11 @@ from neuma_lib.io.files import atomic, read_regular, reading
 from neuma_lib.io.images import open_image
 from neuma_lib.project.capture_folder import HEIF
 
-ORIENTATION = 0x0112
-"""EXIF tag of the orientation."""
+ORIENTATION = 0x0112  # EXIF tag of the orientation
 QUARTER_TURNS = {1: 0, 6: 1, 3: 2, 8: 3}
 """Clockwise quarter turns after which a stored picture is upright, by EXIF orientation."""
 _STORED_UPRIGHT = 6  # orientation of a picture that was stored upright and turned back by `read_picture`
-SHEET_WIDTH = 1600
-"""Width of a contact sheet [px]."""
+SHEET_WIDTH = 1600  # width of a contact sheet [px]
 
 
 def group_of(name: str) -> str:

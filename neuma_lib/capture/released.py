@@ -45,14 +45,11 @@ from neuma_lib.io.images import OPENGL_TO_OPENCV
 from neuma_lib.project.capture_folder import PHOTOGRAPHS
 from neuma_lib.project.released_captures import UNPACK, floor_height, object_folder, sequence
 
-RATE = 120.0
-"""Frames per second of the videos."""
-CALIBRATED_SIZE = (4752, 2672)
-"""Picture size of the intrinsics in cameras.bin [px]."""
+RATE = 120.0  # frames per second of the videos
+CALIBRATED_SIZE = (4752, 2672)  # picture size of the intrinsics in cameras.bin [px]
 ROOM_FROM_WORLD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """From the axes of the files (z down) to the room's (y up)."""
-MIDDLE = (0.15, 0.20)
-"""x and y of the middle of the volume for objects in Spring-Gaus' settings."""
+MIDDLE = (0.15, 0.20)  # x and y of the middle of the volume for objects in Spring-Gaus' settings
 _MASK_MARGIN = 3  # width of the border around a mask that may still show the object [px]
 _MODELS = {0: "SIMPLE_PINHOLE", 1: "PINHOLE", 2: "SIMPLE_RADIAL", 3: "RADIAL", 4: "OPENCV"}
 _PARAMETERS = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8}
@@ -61,37 +58,25 @@ _SUFFIXES = (".jpg", ".jpeg", ".png")
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A picture with its mask and camera.
+    """A picture with its mask and camera."""
 
-    Attributes:
-        picture, mask: files.
-        lens: of the picture.
-        viewmat: world to camera, OpenCV axes, (4, 4), in the world of the files.
-        number: of the frame, or index of the photograph.
-    """
-
+    # picture, mask: files
     picture: Path
     mask: Path
-    lens: Lens
-    viewmat: np.ndarray
-    number: int
+    lens: Lens  # of the picture
+    viewmat: np.ndarray  # world to camera, OpenCV axes, (4, 4), in the world of the files
+    number: int  # of the frame, or index of the photograph
 
 
 @dataclass(frozen=True, eq=False)
 class Released:
-    """The files of one object.
+    """The files of one object."""
 
-    Attributes:
-        videos: camera -> its frames, ordered by number.
-        photographs: of the object at rest, in another world, possibly none.
-        contact: number of the first frame of contact. None if not given.
-        ground: z of the floor.
-    """
-
-    videos: dict[str, list[Shot]]
+    videos: dict[str, list[Shot]]  # camera -> its frames, ordered by number
+    # of the object at rest, in another world, possibly none
     photographs: list[Shot] = field(default_factory=list)
-    contact: int | None = None
-    ground: float = 0.0
+    contact: int | None = None  # number of the first frame of contact. None if not given.
+    ground: float = 0.0  # z of the floor
 
 
 def read_released(folder: str | Path, name: str, ground: float | None = None) -> Released:
@@ -110,8 +95,7 @@ def read_released(folder: str | Path, name: str, ground: float | None = None) ->
     return _spring_gaus(folder, name, ground) if is_spring_gaus else _neuma(folder, ground)
 
 
-CONTACT = 5
-"""Number of frames of free flight in NeuMA's settings."""
+CONTACT = 5  # number of frames of free flight in NeuMA's settings
 
 
 def read_configured(name: str, settings: ReleasedConfig) -> Released:

@@ -1,7 +1,5 @@
 """Commands ``dataset`` and ``score``."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 from typing import Any

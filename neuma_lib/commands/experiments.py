@@ -1,7 +1,5 @@
 """Commands ``next`` and ``lab``."""
 
-from __future__ import annotations
-
 import argparse
 import subprocess
 import sys

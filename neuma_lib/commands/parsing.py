@@ -1,7 +1,5 @@
 """Parts of the parser that commands share."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable
 from typing import Any

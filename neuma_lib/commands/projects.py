@@ -1,7 +1,5 @@
 """Commands ``demo``, ``new``, ``select``, ``check``, ``view``, ``clip`` and ``timings``."""
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import subprocess

@@ -1,7 +1,5 @@
 """What all sections of the settings have in common."""
 
-from __future__ import annotations
-
 import typing
 from functools import cache
 from typing import Annotated, Any, Literal
@@ -11,8 +9,7 @@ from pydantic.fields import FieldInfo
 
 Seed = Annotated[int, Field(ge=0, lt=2**31)]
 Vector = tuple[float, float, float]
-Compared = Literal["colour", "masks"]
-"""What of an image is compared."""
+Compared = Literal["colour", "masks"]  # what of an image is compared
 
 
 def no_boolean(value: Any) -> Any:
@@ -25,8 +22,7 @@ def no_boolean(value: Any) -> Any:
     return value
 
 
-Constant = Annotated[float, BeforeValidator(no_boolean)]
-"""A number by a name that is no field."""
+Constant = Annotated[float, BeforeValidator(no_boolean)]  # a number by a name that is no field
 
 
 class Section(BaseModel):

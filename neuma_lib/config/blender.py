@@ -1,7 +1,5 @@
 """Settings of Blender: appearance of objects, sizes of image sets, processes."""
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 from pydantic import Field

@@ -1,15 +1,12 @@
 """Settings of the board that is printed for captures."""
 
-from __future__ import annotations
-
-from typing import Literal
+from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
 from neuma_lib.config.base import Section, internal
 
-PAPERS = {"A4": (0.210, 0.297), "A3": (0.297, 0.420)}
-"""Width and height of a page [m]."""
+PAPERS = {"A4": (0.210, 0.297), "A3": (0.297, 0.420)}  # width and height of a page [m]
 
 
 class BoardConfig(Section):
@@ -26,7 +23,7 @@ class BoardConfig(Section):
     )
 
     @model_validator(mode="after")
-    def _markers_suffice(self) -> BoardConfig:
+    def _markers_suffice(self) -> Self:
         columns, rows = self.squares
         if min(columns, rows) < 3 or columns * rows > 200:
             raise ValueError("squares: expected at least 3 in each direction, and at most 200 in total")

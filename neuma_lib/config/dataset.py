@@ -1,8 +1,6 @@
 """Settings of the ground truth and its images."""
 
-from __future__ import annotations
-
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -79,7 +77,7 @@ class DatasetConfig(Section):
     blender: BlenderConfig = Field(BlenderConfig(), description="rendering of both image sets")
 
     @model_validator(mode="after")
-    def _one_rule_for_frames(self) -> DatasetConfig:
+    def _one_rule_for_frames(self) -> Self:
         if (self.frames is None) == (self.stride is None):
             raise ValueError("give either frames or stride, and null for the other")
         return self

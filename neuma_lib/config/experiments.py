@@ -1,6 +1,6 @@
 """Settings of experiments: learned laws on other bodies, several bodies, or longer motions."""
 
-from __future__ import annotations
+from typing import Self
 
 from pydantic import Field, model_validator
 
@@ -30,7 +30,7 @@ class BodyConfig(Section):
     spin: Vector | None = Field(None, description="initial angular velocity [rad/s]; null: the scene's")
 
     @model_validator(mode="after")
-    def _placed_only_with_a_shape(self) -> BodyConfig:
+    def _placed_only_with_a_shape(self) -> Self:
         placed = [
             key for key in ("size", "height", "center", "velocity", "spin") if getattr(self, key) is not None
         ]

@@ -1,7 +1,5 @@
 """Settings of the static reconstruction: the fit of Gaussians to the views at t = 0."""
 
-from __future__ import annotations
-
 from pydantic import Field
 
 from neuma_lib.config.base import Section, internal

@@ -1,7 +1,5 @@
 """Settings of the surface mesh and the particles in it."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 from pydantic import Field

@@ -1,7 +1,5 @@
 """Settings of the identification of an analytic law from a video."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 from pydantic import Field

@@ -1,7 +1,5 @@
 """Analytic material laws, as scenes and priors specify them."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from pydantic import ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer

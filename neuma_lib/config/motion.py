@@ -1,7 +1,5 @@
 """Options that all methods share: simulation of a motion, and motion of the Gaussians."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 from pydantic import Field

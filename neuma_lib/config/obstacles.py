@@ -1,11 +1,9 @@
 """Settings of obstacles in a scene, as the arguments of `neuma_lib.sim.colliders`."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any
+from typing import Any, Self
 
 from pydantic import Field, model_validator
 
@@ -61,7 +59,7 @@ class ColliderConfig(Section):
     )
 
     @model_validator(mode="after")
-    def _shape_is_whole(self) -> ColliderConfig:
+    def _shape_is_whole(self) -> Self:
         if is_mesh_file(self.shape):
             lengths: Sequence[str] = ("longest side",)
         elif self.shape in LENGTHS:
@@ -103,7 +101,7 @@ class RegionConfig(Section):
     highest: Vector = Field(description="opposite corner, larger on every axis [m]")
 
     @model_validator(mode="after")
-    def _region_is_whole(self) -> RegionConfig:
+    def _region_is_whole(self) -> Self:
         if not all(low < high for low, high in zip(self.lowest, self.highest, strict=True)):
             raise InputError("highest", f"{list(self.highest)} must exceed lowest on every axis")
         return self
@@ -120,7 +118,7 @@ class ClampConfig(RegionConfig):
     )
 
     @model_validator(mode="after")
-    def _times_ascend(self) -> ClampConfig:
+    def _times_ascend(self) -> Self:
         _check_times(self.keyframes)
         return self
 

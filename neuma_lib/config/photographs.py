@@ -4,8 +4,6 @@ They apply if a transforms.json has the entry ``photographs``, as those of captu
 sets: ``"photographs": {"floor": 0.0}``, with the height y of the floor below the object [m], or null.
 """
 
-from __future__ import annotations
-
 from neuma_lib.config.base import Section, internal
 
 

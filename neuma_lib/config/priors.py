@@ -1,7 +1,5 @@
 """Settings of the priors: analytic laws, and the networks trained on them."""
 
-from __future__ import annotations
-
 from pydantic import Field
 
 from neuma_lib.config.base import Section, Seed, internal

@@ -1,9 +1,7 @@
 """Settings of scenes."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -59,12 +57,10 @@ class CapturedConfig(Section):
     grid: int | None = internal(None, "grid cells along each side of the box; null: captures.grid", ge=8)
 
 
-MAX_BODIES = 5
-"""Bodies of a scene, as of `neuma_lib.sim.bodies`, which settings do not import."""
+MAX_BODIES = 5  # bodies of a scene, as of `neuma_lib.sim.bodies`, which settings do not import
 OF_THE_TRUTH = ("shape", "height", "velocity", "law", "appearance")
 """Keys of the simulation and the renders of the truth, unknown for a captured object."""
-OF_A_VIDEO = ("steps",)
-"""Keys that follow from the files of a captured video."""
+OF_A_VIDEO = ("steps",)  # keys that follow from the files of a captured video
 OF_A_SPLAT = {
     "size": 0.4, "height": 0.5, "velocity": (0.0, 0.0, 0.0), "dt": 5e-4, "steps": 1000, "prior": "jelly",
     **dict.fromkeys(("shape", "law", "appearance")),
@@ -207,7 +203,7 @@ class SceneConfig(Section):
         return {**dict.fromkeys((*OF_THE_TRUTH, *OF_A_VIDEO)), **raw} if raw.get("captured") else raw
 
     @model_validator(mode="after")
-    def _truth_is_whole(self) -> SceneConfig:
+    def _truth_is_whole(self) -> Self:
         unknown = OF_A_SPLAT if self.splat else dict.fromkeys(OF_THE_TRUTH) if self.bodies else {}
         for key in (*OF_THE_TRUTH, *OF_A_VIDEO):
             if self.captured is None and getattr(self, key) is None and unknown.get(key, ...) is not None:
@@ -219,7 +215,7 @@ class SceneConfig(Section):
         return self
 
     @model_validator(mode="after")
-    def _bodies_are_whole(self) -> SceneConfig:
+    def _bodies_are_whole(self) -> Self:
         if not self.bodies:
             if self.pairs:
                 raise ValueError("pairs: need bodies")
@@ -238,13 +234,13 @@ class SceneConfig(Section):
         return self
 
     @model_validator(mode="after")
-    def _clamped_bodies_rest(self) -> SceneConfig:
+    def _clamped_bodies_rest(self) -> Self:
         if self.clamps and any((*(self.velocity or ()), *self.spin)):
             raise ValueError("clamps: a clamped body starts at rest; set velocity and spin to [0, 0, 0]")
         return self
 
     @model_validator(mode="after")
-    def _frames_ascend(self) -> SceneConfig:
+    def _frames_ascend(self) -> Self:
         frames = self.frames
         if frames is not None and (
             list(frames) != sorted(set(frames))

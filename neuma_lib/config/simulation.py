@@ -1,7 +1,5 @@
 """Settings of the simulator."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, Literal
 
@@ -9,13 +7,11 @@ from pydantic import Field, ValidationInfo, field_validator
 
 from neuma_lib.config.base import Section, Vector
 
-GRAVITY = 9.81
-"""Gravity in the room of a capture [m/s^2]."""
+GRAVITY = 9.81  # gravity in the room of a capture [m/s^2]
 
 
 WALLS = ("x_min", "x_max", "y_min", "y_max", "z_min", "z_max")
-CONDITIONS = ("no_slip", "slip", "sticky")
-"""As of `neuma_lib.sim.model`, which settings do not import."""
+CONDITIONS = ("no_slip", "slip", "sticky")  # as of `neuma_lib.sim.model`, which settings do not import
 
 
 class SimulationConfig(Section):

@@ -1,6 +1,6 @@
 """Settings of tests on specimens: records of a clamped beam that is released."""
 
-from __future__ import annotations
+from typing import Self
 
 from pydantic import Field, PositiveFloat, model_validator
 
@@ -39,7 +39,7 @@ class SpecimenConfig(Section):
     cells: tuple[int, ...] = internal((4, 6), "cells along the height, with a fit for each", min_length=1)
 
     @model_validator(mode="after")
-    def _consistent(self) -> SpecimenConfig:
+    def _consistent(self) -> Self:
         if self.along[-1] == self.up[-1]:
             raise ValueError(f"up: {self.up} is the axis along the beam as well")
         parts = self.law.plain().values()

@@ -1,7 +1,5 @@
 """Settings of a scene whose object is a splat."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 from pydantic import Field

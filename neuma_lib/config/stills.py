@@ -1,6 +1,6 @@
 """Settings of bodies at rest in photographs."""
 
-from __future__ import annotations
+from typing import Self
 
 from pydantic import Field, model_validator
 
@@ -64,7 +64,7 @@ class StillsConfig(Section):
     )
 
     @model_validator(mode="after")
-    def _agree(self) -> StillsConfig:
+    def _agree(self) -> Self:
         if not self.sizes[0] > self.sizes[1] > 0:
             raise InputError("sizes", f"{list(self.sizes)} must be two positive sizes, the larger first")
         for name, body in self.bodies.items():

@@ -1,8 +1,6 @@
 """Settings of the tables."""
 
-from __future__ import annotations
-
-from typing import Literal
+from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -32,7 +30,7 @@ class TableConfig(Section):
     )
 
     @model_validator(mode="after")
-    def _has_columns(self) -> TableConfig:
+    def _has_columns(self) -> Self:
         if not self.scenes and not self.experiments:
             raise ValueError("give at least one scene or experiment")
         return self

@@ -1,7 +1,5 @@
 """Settings of the adaptation of the material law to a video."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 from pydantic import Field

@@ -1,7 +1,5 @@
 """From raw values to a section of the settings, with errors that name keys by their path."""
 
-from __future__ import annotations
-
 import difflib
 import types
 import typing

@@ -5,8 +5,6 @@ a scene or experiment has its seeds in the name, except 0. Files that several re
 `replicate_folder`, and are computed once.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Collection, Iterable, Mapping
 
@@ -17,8 +15,7 @@ NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 """Names of scenes, methods, captures, takes and cameras. Folders of results are named after them."""
 RESERVED = ("benchmarks", "experiments", "figures", "kernels", "logs", "none", "priors", "weights")
 """Folders of results and data that belong to no scene or method, and what patterns contain in place of no name."""
-SEEDS = ("prior", "gaussians", "particles", "adaptor")
-"""What the seeds of a replicate change, in order."""
+SEEDS = ("prior", "gaussians", "particles", "adaptor")  # what the seeds of a replicate change, in order
 
 
 def name_problem(name: str) -> str:
@@ -34,9 +31,6 @@ def split_variant(
     """Split ``base+key=value+key=value``.
 
     Args:
-        text: the name.
-        bases: known bases.
-        keys: known keys.
         kind: for messages, for example "method".
 
     Raises:

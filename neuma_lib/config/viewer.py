@@ -1,7 +1,5 @@
 """Settings of the viewer."""
 
-from __future__ import annotations
-
 from pydantic import Field
 
 from neuma_lib.config.base import Section, internal

@@ -10,19 +10,12 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Binding:
-    """Sparse binding matrix B in compressed sparse row (CSR) format.
+    """Sparse binding matrix B in compressed sparse row (CSR) format."""
 
-    Attributes:
-        indptr: start of each row in ``indices``, int64, shape (G + 1,).
-        indices: bound particles, ascending in each row, int64, shape (nnz,).
-        values: weights, shape (nnz,); every non-empty row sums to 1.
-        shape: (Gaussian count G, particle count N).
-    """
-
-    indptr: Tensor
-    indices: Tensor
-    values: Tensor
-    shape: tuple[int, int]
+    indptr: Tensor  # start of each row in ``indices``, int64, shape (G + 1,)
+    indices: Tensor  # bound particles, ascending in each row, int64, shape (nnz,)
+    values: Tensor  # weights, shape (nnz,); every non-empty row sums to 1
+    shape: tuple[int, int]  # (Gaussian count G, particle count N)
     _compressed: dict = field(default_factory=dict, repr=False, compare=False)
 
     @classmethod

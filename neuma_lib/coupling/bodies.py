@@ -1,7 +1,5 @@
 """Several bodies on one grid, and solids without a video, with one Gaussian per particle."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
@@ -17,13 +15,10 @@ from neuma_lib.mechanics.density import Density, density_at
 from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.splatting.spherical_harmonics import rgb_to_sh0
 
-_WIDTH = 0.55
-"""Standard deviation of a Gaussian in particle spacings, for closed surfaces with sharp edges."""
+_WIDTH = 0.55  # standard deviation of a Gaussian in particle spacings, for closed surfaces with sharp edges
 _OPACITY = 0.95
-_LIGHT = (0.35, 0.8, 0.5)
-"""Direction to the light: from above, slightly to the right of the camera."""
-_AMBIENT = 0.45
-"""Brightness of surfaces that face away from the light."""
+_LIGHT = (0.35, 0.8, 0.5)  # direction to the light: from above, slightly to the right of the camera
+_AMBIENT = 0.45  # brightness of surfaces that face away from the light
 
 
 def join(bodies: Sequence[Reconstruction]) -> Reconstruction:

@@ -1,7 +1,5 @@
 """Particle-driven motion of Gaussians (paper Sec. 3.3, Particle-GS)."""
 
-from __future__ import annotations
-
 import torch
 
 from neuma_lib.coupling.binding import Binding

@@ -9,7 +9,6 @@ float32, and write neighbouring results. Frames are the slow index, so the rows 
 its Gaussians read them, about seven times each.
 """
 
-# No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
 import functools
 from types import SimpleNamespace
 
@@ -21,8 +20,7 @@ from neuma_lib.mechanics.singular_values_kernels import warp_types
 
 start_warp()
 
-PARTS = 3
-"""Groups of four numbers in a row of a vector and a 3x3 matrix."""
+PARTS = 3  # groups of four numbers in a row of a vector and a 3x3 matrix
 
 
 @functools.cache

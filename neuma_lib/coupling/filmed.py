@@ -1,7 +1,5 @@
 """Renders of a simulated body for the cameras and frames of an observation, with motion blur."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import torch

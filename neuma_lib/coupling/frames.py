@@ -1,7 +1,5 @@
 """The Gaussians of a moving body at one time as standalone Gaussians, for export."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import torch

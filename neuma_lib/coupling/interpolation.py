@@ -1,7 +1,5 @@
 """Interpolation of the motion of anchors at nearby points."""
 
-from __future__ import annotations
-
 import warnings
 
 import numpy as np

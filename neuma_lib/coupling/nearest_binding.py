@@ -4,8 +4,6 @@ Algorithm 1 of the paper adds a particle at the centre of every Gaussian that co
 of an image-to-3D model has tens of thousands of such Gaussians on the surface, which would dominate the simulation.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
@@ -16,10 +14,8 @@ from neuma_lib.coupling.binding import Binding
 from neuma_lib.coupling.particle_binding import bind
 from neuma_lib.errors import InputError
 
-ENOUGH = 4
-"""Minimum number of particles in a Gaussian's ellipsoid for a binding by Algorithm 1."""
-NEAREST = 10
-"""Number of particles bound to a Gaussian with fewer."""
+ENOUGH = 4  # minimum number of particles in a Gaussian's ellipsoid for a binding by Algorithm 1
+NEAREST = 10  # number of particles bound to a Gaussian with fewer
 
 
 def bind_nearest(

@@ -19,13 +19,10 @@ from neuma_lib.coupling.particle_binding_kernels import search
 from neuma_lib.device import launch
 from neuma_lib.errors import InputError
 
-_FLATTEST = 1e-12
-"""Minimum eigenvalue of a covariance, relative to its largest one."""
+_FLATTEST = 1e-12  # minimum eigenvalue of a covariance, relative to its largest one
 _CELLS_ALONG_Z = 2**20
-_SHARING_NEIGHBOURS = 16
-"""Number of particles that give volume to an added particle."""
-_MAX_SHARE = 0.5
-"""Maximum fraction of a particle's volume that goes to added particles."""
+_SHARING_NEIGHBOURS = 16  # number of particles that give volume to an added particle
+_MAX_SHARE = 0.5  # maximum fraction of a particle's volume that goes to added particles
 _UNBALANCED = 1e-9
 """Residual, relative to the neighbours' distance, above which no shares balance an added particle."""
 
@@ -133,25 +130,16 @@ def _checked_volumes(volumes: Tensor | float, count: int) -> np.ndarray:
 
 
 class _Columns(NamedTuple):
-    """Points (N, 3) sorted into the cells of a grid: columns over the squares of a plane, divided along z.
+    """Points (N, 3) sorted into the cells of a grid: columns over the squares of a plane, divided along z."""
 
-    Attributes:
-        lower: corner of the grid [m], (3,).
-        sides: sides of a cell [m], (3,), so short along z that points of a column are almost sorted by z.
-        shape: number of cells, (3,).
-        begins: first point of each column, and the end, int32.
-        depths: cell of each point along z, int32, (N,).
-        order: index of each point, int32, (N,).
-        points: positions [m], column after column, ascending in z.
-    """
-
-    lower: Tensor
+    lower: Tensor  # corner of the grid [m], (3,)
+    # sides of a cell [m], (3,), so short along z that points of a column are almost sorted by z
     sides: Tensor
-    shape: Tensor
-    begins: Tensor
-    depths: Tensor
-    order: Tensor
-    points: Tensor
+    shape: Tensor  # number of cells, (3,)
+    begins: Tensor  # first point of each column, and the end, int32
+    depths: Tensor  # cell of each point along z, int32, (N,)
+    order: Tensor  # index of each point, int32, (N,)
+    points: Tensor  # positions [m], column after column, ascending in z
 
     @classmethod
     def of(cls, points: Tensor) -> _Columns:
@@ -175,19 +163,12 @@ class _Columns(NamedTuple):
 
 
 class _Ellipsoids(NamedTuple):
-    """Confidence ellipsoids of Gaussians.
+    """Confidence ellipsoids of Gaussians."""
 
-    Attributes:
-        centres: [m], (G, 3).
-        whitening: matrices W with ``|W d|^2 = d^T A^-1 d``, (G, 3, 3).
-        half: half the sides of the bounding boxes [m], (G, 3).
-        threshold: maximum squared Mahalanobis distance of a bound particle.
-    """
-
-    centres: Tensor
-    whitening: Tensor
-    half: Tensor
-    threshold: float
+    centres: Tensor  # [m], (G, 3)
+    whitening: Tensor  # matrices W with ``|W d|^2 = d^T A^-1 d``, (G, 3, 3)
+    half: Tensor  # half the sides of the bounding boxes [m], (G, 3)
+    threshold: float  # maximum squared Mahalanobis distance of a bound particle
 
     @classmethod
     def of(cls, centres: Tensor, shapes: Tensor, settings: BindingConfig) -> _Ellipsoids:

@@ -1,6 +1,5 @@
 """Kernel of :mod:`neuma_lib.coupling.particle_binding`: search for the points in an ellipsoid in columns of cells."""
 
-# No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
 import warp as wp
 
 from neuma_lib.device import start_warp

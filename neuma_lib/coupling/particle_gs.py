@@ -1,7 +1,5 @@
 """Particle-GS (paper Sec. 3.3): Gaussians moved by simulated particles and rendered to images."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import torch
@@ -13,8 +11,7 @@ from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.splatting.rasterizer import rasterize, rasterized_error
 
-_CACHE_BYTES = 16e6
-"""Size of the buffers of one batch of frames on a CPU, so that they stay in its cache."""
+_CACHE_BYTES = 16e6  # size of the buffers of one batch of frames on a CPU, so that they stay in its cache
 _GPU_SHARE, _GPU_BYTES = 1 / 16, 4e9
 """The same on a GPU: fraction of its memory, and maximum. A batch has an overhead of about one millisecond."""
 

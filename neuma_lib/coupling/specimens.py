@@ -1,7 +1,5 @@
 """Specimens of a test: a body with a clamped end, which is released, in the cube of the simulation."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -32,27 +30,20 @@ _GAP = 0.5
 cells, so that the body is held exactly from there on."""
 _PER_CELL = 2  # particles along an edge of a cell
 _COURANT = 0.7
-_NO_VOLUME = 1e-6
-"""Volume of a particle of a load, as a share of that of others."""
+_NO_VOLUME = 1e-6  # volume of a particle of a load, as a share of that of others
 
 
 @dataclass(frozen=True)
 class Beam:
-    """A beam of rectangular section that is clamped at x = 0 and free at x = length, with y up.
+    """A beam of rectangular section that is clamped at x = 0 and free at x = length, with y up."""
 
-    Attributes:
-        length, height, width: along x, y and z [m].
-        density: [kg/m^3].
-        gravity: acceleration along -y [m/s^2].
-        load: mass at the upper edge of the free end [kg], spread over the width.
-    """
-
+    # length, height, width: along x, y and z [m]
     length: float
     height: float
     width: float
-    density: float
-    gravity: float = 9.81
-    load: float = 0.0
+    density: float  # [kg/m^3]
+    gravity: float = 9.81  # acceleration along -y [m/s^2]
+    load: float = 0.0  # mass at the upper edge of the free end [kg], spread over the width
 
     def mesh(self) -> Hexahedra:
         """Elements of about half the height. Those at x < 0 are clamped."""
@@ -72,24 +63,16 @@ class Beam:
 
 @dataclass(frozen=True, eq=False)
 class Specimen:
-    """A body in the cube, ready to be released.
+    """A body in the cube, ready to be released."""
 
-    Attributes:
-        model, start: of the simulation, in which the edge of the cube is 1.
-        places: of the particles in the undeformed body [m], shape (N, 3).
-        edge: edge of the cube [m].
-        turn: from the axes of the body to those of the cube, shape (3, 3).
-        origin: centre of the section at the clamp [m], shape (3,).
-        root: the same in the cube, shape (3,).
-    """
-
+    # model, start: of the simulation, in which the edge of the cube is 1
     model: MPM
     start: State
-    places: Tensor
-    edge: float
-    turn: Tensor
-    origin: Tensor
-    root: Tensor
+    places: Tensor  # of the particles in the undeformed body [m], shape (N, 3)
+    edge: float  # edge of the cube [m]
+    turn: Tensor  # from the axes of the body to those of the cube, shape (3, 3)
+    origin: Tensor  # centre of the section at the clamp [m], shape (3,)
+    root: Tensor  # the same in the cube, shape (3,)
 
     def law(self, spec: Mapping[str, Any]) -> Law:
         """The law of the simulation for constants of the world."""
@@ -107,11 +90,7 @@ def clamped_beam(
     dtype: torch.dtype = torch.float32,
     held: tuple[Hexahedra, Equilibrium] | None = None,
 ) -> Specimen:
-    """The beam on a grid with some cells along its height, see `clamped_body`.
-
-    Args:
-        cells: cells along the height.
-    """
+    """The beam on a grid with some cells along its height, see `clamped_body`. ``cells``: cells along the height."""
     dx = beam.height / cells
     count = max(1, round(_PER_CELL * beam.width / dx))
     load = None

@@ -6,8 +6,6 @@ by default, because the paper evaluates a law in the discretisation of its train
 `scenes.<name>.truth` refine the truth.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -24,50 +22,33 @@ from neuma_lib.sim.model import MPM, consecutive
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State, Trajectory
 
-PER_CELL = 8
-"""Particles in a cell of a converged truth."""
+PER_CELL = 8  # particles in a cell of a converged truth
 
 
 @dataclass(frozen=True)
 class TrueBody:
-    """A solid at its initial position.
+    """A solid at its initial position."""
 
-    Attributes:
-        mesh: surface, watertight [m].
-        law: analytic material.
-        velocity: initial velocity [m/s].
-        density: mass density [kg/m^3], see `neuma_lib.mechanics.density`.
-        spin: initial angular velocity about the centre of mass [rad/s].
-    """
-
-    mesh: trimesh.Trimesh
-    law: Law
-    velocity: Sequence[float]
-    density: Density = 1000.0
-    spin: Sequence[float] = (0.0, 0.0, 0.0)
+    mesh: trimesh.Trimesh  # surface, watertight [m]
+    law: Law  # analytic material
+    velocity: Sequence[float]  # initial velocity [m/s]
+    density: Density = 1000.0  # mass density [kg/m^3], see `neuma_lib.mechanics.density`
+    spin: Sequence[float] = (0.0, 0.0, 0.0)  # initial angular velocity about the centre of mass [rad/s]
 
 
 @dataclass(frozen=True)
 class GroundTruth:
-    """Simulated bodies, with concatenated particles.
+    """Simulated bodies, with concatenated particles."""
 
-    Attributes:
-        frames: simulation steps of the frames, length T.
-        path: particle states at the frames (x [m], v [m/s], F), N particles.
-        tracers: passive tracers from a jittered grid in the true shapes [m], shape (T, M, 3).
-        tracers_again: tracers from another jittered grid, shape (T, M', 3). Their distance to ``tracers`` is the
-            sampling floor of the Chamfer distance.
-        vol0: particle volumes [m^3], shape (N,).
-        mass: particle masses [kg], shape (N,).
-        body, tracer_body: index of the body of each particle (N,) and of each of ``tracers`` (M,).
-    """
-
-    frames: tuple[int, ...]
-    path: Trajectory
-    tracers: Tensor
+    frames: tuple[int, ...]  # simulation steps of the frames, length T
+    path: Trajectory  # particle states at the frames (x [m], v [m/s], F), N particles
+    tracers: Tensor  # passive tracers from a jittered grid in the true shapes [m], shape (T, M, 3)
+    # tracers from another jittered grid, shape (T, M', 3). Their distance to ``tracers`` is the sampling
+    # floor of the Chamfer distance.
     tracers_again: Tensor
-    vol0: Tensor
-    mass: Tensor
+    vol0: Tensor  # particle volumes [m^3], shape (N,)
+    mass: Tensor  # particle masses [kg], shape (N,)
+    # body, tracer_body: index of the body of each particle (N,) and of each of ``tracers`` (M,)
     body: Tensor
     tracer_body: Tensor
 
@@ -87,8 +68,6 @@ def simulate_ground_truth(
     """Fill bodies with particles and simulate them on one grid.
 
     Args:
-        model: simulator constants.
-        bodies: simulated bodies.
         frames: steps to store, 0 is the start.
         particles: requested number in each body. None: `PER_CELL` in a cell.
         tracers: requested number in all bodies together, with uniform density.

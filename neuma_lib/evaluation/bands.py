@@ -22,8 +22,6 @@ are not sampled. A part of the law is sampled even if training did not change it
 Replicates, reconstructions of the same video with other seeds, add a further error. `envelope` contains their bands.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -51,17 +49,12 @@ from neuma_lib.mechanics.structured import (
 )
 
 DRAWS = 100
-SILENT = LIMIT / 2
-"""Standard deviation of the deviation of a log-modulus in states without data."""
-LENGTH = 3 * STRAIN
-"""Strain at which features of untrained networks have the correlation exp(-1/2)."""
-FEATURES = 150
-"""Random features of the Gaussian process."""
-STATES = 20_000
-"""Approximate maximum number of states of a motion."""
+SILENT = LIMIT / 2  # standard deviation of the deviation of a log-modulus in states without data
+LENGTH = 3 * STRAIN  # strain at which features of untrained networks have the correlation exp(-1/2)
+FEATURES = 150  # random features of the Gaussian process
+STATES = 20_000  # approximate maximum number of states of a motion
 _DIFFERENCE = 1e-4  # step of an unbounded constant
-Output = tuple[str, int]
-"""Part of a law, and index of an output of its network."""
+Output = tuple[str, int]  # part of a law, and index of an output of its network
 Band = tuple[np.ndarray, np.ndarray]
 
 
@@ -78,13 +71,11 @@ def corrected_draws(
     """Sample laws around a structured one whose base was identified.
 
     Args:
-        law: the structured law.
         fit: ``best`` of its identified.json.
         visited: elastic deformation gradients of the motion that it predicts, shape (..., 3, 3).
         model_std: see `constants_draws`.
         spread: prior standard deviation of the unbounded constants.
         dt: time step [s].
-        count: number of laws.
 
     Raises:
         InputError: a law of the form "energy".
@@ -110,15 +101,10 @@ def corrected_draws(
 
 @dataclass(frozen=True)
 class RandomField:
-    """Random features of a squared exponential kernel of length `LENGTH`, and 1 as the last feature.
+    """Random features of a squared exponential kernel of length `LENGTH`, and 1 as the last feature."""
 
-    Attributes:
-        frequencies: standard normal, shape (M, 3).
-        phases: in turns, shape (M,).
-    """
-
-    frequencies: np.ndarray
-    phases: np.ndarray
+    frequencies: np.ndarray  # standard normal, shape (M, 3)
+    phases: np.ndarray  # in turns, shape (M,)
 
     def __call__(self, z: Tensor) -> Tensor:
         """Features (N, M + 1) at invariants z (N, 3)."""

@@ -9,11 +9,9 @@ Probabilities of families follow from their scores with a temperature (Guo et al
 from scenes of development seeds. Quantities that it does not have are normal, and the temperature is 1.
 """
 
-from __future__ import annotations
-
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -27,8 +25,7 @@ from neuma_lib.errors import InputError
 FILE = Path(__file__).with_suffix(".json")
 LEVELS = tuple(round(0.05 * n, 2) for n in range(1, 20))
 """Levels with a measured quantile. Others between 0 and the last are interpolated."""
-SHOWN = 0.95
-"""Level of the intervals and bands in tables and figures."""
+SHOWN = 0.95  # level of the intervals and bands in tables and figures
 MATERIAL, GRID = "material", "grid"
 MOTION = {MATERIAL: "motion of the material", GRID: "motion on the grid"}
 QUANTITIES = (MATERIAL, GRID, *MOTION.values())
@@ -44,11 +41,7 @@ class Quantiles:
     values: tuple[float, ...]
 
     def at(self, level: float) -> float:
-        """The quantile at a level.
-
-        Raises:
-            InputError: the level is not between 0 and the last of `LEVELS`.
-        """
+        """The quantile at a level. Raises InputError: the level is not between 0 and the last of `LEVELS`."""
         if not 0 <= level <= LEVELS[-1]:
             raise InputError("level", f"{level!r} must be between 0 and {LEVELS[-1]}")
         return float(np.interp(level, (0.0, *LEVELS), (0.0, *self.values)))
@@ -63,19 +56,6 @@ class Quantiles:
 
 
 NORMAL = Quantiles(tuple(NormalDist().inv_cdf((1 + level) / 2) for level in LEVELS))
-
-
-def measured_quantiles(z: Sequence[float]) -> Quantiles:
-    """Quantiles of errors in estimated standard deviations, of which new ones are below with at least the probability.
-
-    At a level p it is the ceil(p (n + 1))-th smallest of n values, or the largest if there are too few (Lei et al.
-    2018, Theorem 2.1).
-    """
-    sizes, n = np.sort(np.abs(np.asarray(z, dtype=float))), len(z)
-    if n == 0:
-        raise InputError("errors", "there are none to measure quantiles of", "Give more scenes")
-    ranks = [min(n, math.ceil(round(level * (n + 1), 9))) for level in LEVELS]
-    return Quantiles(tuple(float(sizes[rank - 1]) for rank in ranks))
 
 
 @cache

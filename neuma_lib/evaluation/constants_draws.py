@@ -5,8 +5,6 @@ that normal distribution, with the error that all images share (`identify.model_
 best one get equal parts of the samples.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 
@@ -57,7 +55,6 @@ def stable_law(fit: Mapping[str, Any], model: MPM, density: float) -> Law:
 
     Args:
         fit: its entry "best" or "material". The latter was extrapolated, and may be stiffer.
-        model: simulator.
         density: [kg/m^3].
     """
     family = Family("identified", fit["law"])

@@ -1,34 +1,23 @@
 """Coverage and scores of intervals and probabilities, with their confidence over independent scenes."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 
-from neuma_lib.evaluation.calibration import family_probabilities
-
-BOOTSTRAP = 2000
-"""Resamplings of the scenes."""
+BOOTSTRAP = 2000  # resamplings of the scenes
 CONFIDENCE = 0.95
-TEMPERATURES = tuple(np.geomspace(0.01, 30, 81))
-"""Candidates of `fitted_temperature`."""
 
 
 @dataclass(frozen=True)
 class Intervals:
-    """Intervals at a level and the truths, of one scene.
+    """Intervals at a level and the truths, of one scene."""
 
-    Attributes:
-        low, high: ends.
-        truth: true values, of the same shape.
-    """
-
+    # low, high: ends
     low: np.ndarray
     high: np.ndarray
-    truth: np.ndarray
+    truth: np.ndarray  # true values, of the same shape
 
     @property
     def covered(self) -> np.ndarray:
@@ -75,17 +64,3 @@ def brier_score(probabilities: Mapping[str, float], right: Set[str]) -> float:
     """
     hit = sum(p for name, p in probabilities.items() if name in right)
     return (1 - hit) ** 2 + sum(p**2 for name, p in probabilities.items() if name not in right)
-
-
-def fitted_temperature(scenes: Sequence[tuple[Mapping, Set[str]]]) -> float:
-    """The temperature with the lowest mean Brier score.
-
-    Args:
-        scenes: content of identified.json, or its entries ``families`` and ``compared``, and the names of the true
-            family.
-    """
-    means = [
-        np.mean([brier_score(family_probabilities(known, each), right) for known, right in scenes])
-        for each in TEMPERATURES
-    ]
-    return float(TEMPERATURES[int(np.argmin(means))])

@@ -4,8 +4,6 @@ The measures are restricted to the bounding box of the observed and predicted ob
 background is the same for any prediction.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np
@@ -15,8 +13,7 @@ from torch import Tensor
 from neuma_lib.errors import InputError
 from neuma_lib.evaluation.lpips import LPIPS, SMALLEST
 
-VISIBLE = 0.05
-"""Minimum opacity of a pixel of the object."""
+VISIBLE = 0.05  # minimum opacity of a pixel of the object
 MEASURES = ("psnr", "ssim", "lpips_vgg", "lpips_alex")
 
 

@@ -1,7 +1,5 @@
 """The model card of an exported law: what it has seen, at which discretisation, and what it is not for."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

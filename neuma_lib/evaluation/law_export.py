@@ -1,7 +1,5 @@
 """Export a law and its metadata to one file, with a model card next to it, and read them."""
 
-from __future__ import annotations
-
 import subprocess
 from collections.abc import Callable, Mapping
 from functools import partial

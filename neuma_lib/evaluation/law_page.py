@@ -1,7 +1,5 @@
 """A page that shows a law in three tests of a material point."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

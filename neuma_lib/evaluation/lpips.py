@@ -5,8 +5,6 @@ channels, and the squared differences are weighted by a learned head, averaged o
 weights are numpy arrays in the package `PACKAGE`. `convert` reads them without executing code of their pickles.
 """
 
-from __future__ import annotations
-
 import io as bytes_io
 import pickle
 import pickletools
@@ -32,13 +30,11 @@ CONVOLUTIONS = {
     "vgg": tuple((width, 3, 1, 1) for width in (64, 64, 128, 128, 256, 256, 256, *[512] * 6)),
 }
 """Convolutions (channels, kernel, stride, padding) of each network, each followed by a rectifier."""
-POOLED = {"alex": (1, 2), "vgg": (2, 4, 7, 10)}
-"""Convolutions before which the features are max-pooled."""
+POOLED = {"alex": (1, 2), "vgg": (2, 4, 7, 10)}  # convolutions before which the features are max-pooled
 TAPS = {"alex": (0, 1, 2, 3, 4), "vgg": (1, 3, 6, 9, 12)}
 """Convolutions whose features are compared, after the rectifier."""
 POOL_KERNEL = {"alex": 3, "vgg": 2}
-SMALLEST = 32
-"""Minimum side of an image for both networks [px]."""
+SMALLEST = 32  # minimum side of an image for both networks [px]
 _SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 """Mean and deviation of the training images' colours, in [-1, 1]."""
 _FOLDERS = {"alex": ("alexnet", "AlexNet_0"), "vgg": ("vgg16", "VGG16_0")}

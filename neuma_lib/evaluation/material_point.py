@@ -9,10 +9,8 @@ from torch import Tensor
 
 from neuma_lib.mechanics.law import Constitutive, Law
 
-OUTER = 0.005
-"""Share of the visited states that is ignored at each end of a range, as outliers."""
-_COMPRESSED = 0.05
-"""Quantile of the volume ratio at which shear is tested."""
+OUTER = 0.005  # share of the visited states that is ignored at each end of a range, as outliers
+_COMPRESSED = 0.05  # quantile of the volume ratio at which shear is tested
 _NEWTON_STEPS, _LARGEST_STEP, _DIFFERENCE = 30, 0.05, 1e-6
 """Parameters of the search for traction-free sides, in stretches."""
 

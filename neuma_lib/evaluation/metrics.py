@@ -1,7 +1,5 @@
 """Measures of motion (paper Sec. 4.1). The Chamfer distance is in `neuma_lib.geometry.chamfer`."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

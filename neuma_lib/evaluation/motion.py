@@ -7,8 +7,6 @@ floor, the distance between two sets of points of the same body, which decreases
 distance without the floor.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Protocol

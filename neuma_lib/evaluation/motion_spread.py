@@ -6,8 +6,6 @@ resolutions is added, divided equally among the three axes. As of constants, the
 with measured quantiles (`calibration`). Friction with obstacles is sampled independently of the law's constants.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -32,31 +30,22 @@ from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 
 SHAPES = ("ball", "duck", "pawn", "cat", "fish", "bottle")
-SPEED = 3.0
-"""Of other motions [m/s]."""
+SPEED = 3.0  # of other motions [m/s]
 CLEARANCE = 0.1
 """Height of another shape above the floor at the start [m], plus what it is lower than ``size``."""
-DRAWS = 32
-"""Sampled laws."""
+DRAWS = 32  # sampled laws
 _TOGETHER = 8  # simulations in memory
 _ONE_STD = (0.158655, 0.841345)  # probabilities of a normal variable below -1 and 1 standard deviations
 
 
 @dataclass(frozen=True)
 class Launch:
-    """A body in rigid motion at the start.
+    """A body in rigid motion at the start."""
 
-    Attributes:
-        mesh: its surface [m].
-        velocity: [m/s].
-        spin: angular velocity about the centre of mass [rad/s].
-        density: [kg/m^3].
-    """
-
-    mesh: trimesh.Trimesh
-    velocity: Sequence[float]
-    spin: Sequence[float] = (0.0, 0.0, 0.0)
-    density: float = 1000.0
+    mesh: trimesh.Trimesh  # its surface [m]
+    velocity: Sequence[float]  # [m/s]
+    spin: Sequence[float] = (0.0, 0.0, 0.0)  # angular velocity about the centre of mass [rad/s]
+    density: float = 1000.0  # [kg/m^3]
 
     def state(self, particles: int, seed: int) -> State:
         """The body filled with particles."""
@@ -67,22 +56,16 @@ class Launch:
 
 @dataclass(frozen=True)
 class Resolution:
-    """Simulator and number of particles.
+    """Simulator and number of particles."""
 
-    Attributes:
-        model: frames are steps of it.
-        particles: of the body.
-    """
-
-    model: MPM
-    particles: int
+    model: MPM  # frames are steps of it
+    particles: int  # of the body
 
     def path(self, launch: Launch, law: Law, frames: Sequence[int], points: Tensor, seed: int) -> Tensor:
         """Positions (T, M, 3) [m] of points (M, 3) of a body, computed on their device.
 
         Args:
             frames: steps of the model.
-            seed: of the particles.
         """
         state, law = launch.state(self.particles, seed).to(points.device), law.to(points.device)
         with torch.no_grad():
@@ -92,23 +75,14 @@ class Resolution:
 
 @dataclass(frozen=True)
 class MotionSpread:
-    """Predicted positions of points of a body.
+    """Predicted positions of points of a body."""
 
-    Attributes:
-        first: index of the first frame in contact. The motion depends on the law from there on.
-        points: start positions [m], shape (M, 3).
-        value: with the identified constants [m], shape (T, M, 3).
-        std: standard deviation [m], of the same shape.
-        laplace_std: that of the Laplace approximation, without an error of the simulation.
-        failed: number of sampled laws that left the grid or became non-finite.
-    """
-
-    first: int
-    points: Tensor
-    value: Tensor
-    std: Tensor
-    laplace_std: Tensor
-    failed: int
+    first: int  # index of the first frame in contact. The motion depends on the law from there on.
+    points: Tensor  # start positions [m], shape (M, 3)
+    value: Tensor  # with the identified constants [m], shape (T, M, 3)
+    std: Tensor  # standard deviation [m], of the same shape
+    laplace_std: Tensor  # that of the Laplace approximation, without an error of the simulation
+    failed: int  # number of sampled laws that left the grid or became non-finite
 
 
 def other_motions(scene: Mapping[str, Any]) -> dict[str, Launch]:
@@ -153,7 +127,6 @@ def predict_with_spread(
         times: of the frames [s], ascending, whole numbers of steps of both.
         points: number of points, which are particles of the prediction, evenly drawn.
         model_std: see `constants_draws`.
-        seed: of particles and laws.
         device: of the simulations. The result is on the CPU.
 
     Raises:

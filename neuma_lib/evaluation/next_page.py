@@ -1,7 +1,5 @@
 """Page of the next experiment: the best candidates as pictures, sentences and a table."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,8 +15,7 @@ from neuma_lib.sim.colliders import Collider
 from neuma_lib.sim.state import Trajectory
 from neuma_lib.splatting.cameras import Cameras
 
-SHOWN = 3
-"""Candidates with a picture."""
+SHOWN = 3  # candidates with a picture
 _FRAMES, _PIXELS = 6, 160
 _STRONG = math.log(100)  # evidence that distinguishes families
 
@@ -106,7 +103,6 @@ def page(choice: Mapping[str, Any], picture: str, place: str) -> str:
     Args:
         choice: content of next.json.
         picture: path of the picture relative to the page.
-        place: folder of the scene.
     """
     candidates = choice["candidates"]
     now = ", ".join(f"{name} {_percent(std)}" for name, std in choice["known"].items())
@@ -169,7 +165,6 @@ def draw(
     """Draw a row of frames for each motion, with the edges of boxes that it touches.
 
     Args:
-        file: picture to write.
         motions: experiment and path of each. The last camera is used.
     """
     from matplotlib.figure import Figure

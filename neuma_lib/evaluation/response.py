@@ -1,7 +1,5 @@
 """Response of laws in tests of a material point, over the range of states of a motion."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -15,28 +13,19 @@ from neuma_lib.evaluation.bands import band
 from neuma_lib.evaluation.material_point import Visited, largest_shear_stress, sheared, uniaxial, yielding
 from neuma_lib.mechanics.law import Law
 
-BEYOND = 1.6
-"""Range of the tests relative to the visited range, measured from the undeformed state."""
+BEYOND = 1.6  # range of the tests relative to the visited range, measured from the undeformed state
 SMALLEST_STRETCH = 0.05
-POINTS = 121
-"""Points of a curve."""
-EVERY = 5
-"""Points of a curve per point of its band."""
+POINTS = 121  # points of a curve
+EVERY = 5  # points of a curve per point of its band
 
 
 @dataclass(frozen=True)
 class PointTest:
-    """A test of a material point.
+    """A test of a material point."""
 
-    Attributes:
-        x: prescribed values, (P,).
-        curve: stresses (P',) [Pa] of a law at some of these.
-        visited: visited range of x, or of the stress [Pa] if ``by_stress``.
-    """
-
-    x: Tensor
-    curve: Callable[[Law, Tensor], Tensor]
-    visited: tuple[float, float]
+    x: Tensor  # prescribed values, (P,)
+    curve: Callable[[Law, Tensor], Tensor]  # stresses (P',) [Pa] of a law at some of these
+    visited: tuple[float, float]  # visited range of x, or of the stress [Pa] if ``by_stress``
     by_stress: bool = False
 
 

@@ -1,7 +1,5 @@
 """Score predicted positions of any method by the measures of `neuma_lib.evaluation.motion`."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
@@ -15,8 +13,7 @@ from neuma_lib.geometry.chamfer import chamfer_sequence
 SAME_START = 1e-4
 """Maximum distance of a predicted point from a true tracer at the first frame to be the same point [m]."""
 
-MIN_POINTS = 100
-"""Minimum number of points of a Chamfer distance."""
+MIN_POINTS = 100  # minimum number of points of a Chamfer distance
 
 
 def score_positions(

@@ -23,8 +23,7 @@ from neuma_lib.sim.model import MPM
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 
-STRAINED = 1e-4
-"""Component of F - I above which a body counts as deformed, which marks its first contact."""
+STRAINED = 1e-4  # component of F - I above which a body counts as deformed, which marks its first contact
 PARTS = {
     "stress": "Kirchhoff stress of the visited elastic states",
     "volumetric": "Its volumetric part, the mean of the normal stresses",
@@ -37,18 +36,13 @@ PARTS = {
 
 @dataclass(frozen=True)
 class VisitedStates:
-    """Deformations of material points during a motion.
+    """Deformations of material points during a motion."""
 
-    Attributes:
-        F: elastic deformation gradients, shape (S, 3, 3).
-        F_trial: the same before the return map, shape (S, 3, 3).
-        C: velocity gradients of P points at steps 0 to T - 1 [1/s], shape (T, P, 3, 3). Step n applies I + dt C_n.
-        frames: steps after the first contact at which the stresses of these points are compared.
-    """
-
-    F: Tensor
-    F_trial: Tensor
+    F: Tensor  # elastic deformation gradients, shape (S, 3, 3)
+    F_trial: Tensor  # the same before the return map, shape (S, 3, 3)
+    # velocity gradients of P points at steps 0 to T - 1 [1/s], shape (T, P, 3, 3). Step n applies I + dt C_n.
     C: Tensor
+    # steps after the first contact at which the stresses of these points are compared
     frames: tuple[int, ...]
 
     @classmethod
@@ -73,7 +67,6 @@ def visit(
         frames: steps of the video's frames. States are sampled uniformly from those after the first contact.
         states: S, sampled independently, with particles in proportion to their volumes.
         paths: P, sampled the same way without replacement, at most one for each particle.
-        seed: of the random numbers.
 
     Raises:
         InputError: nothing is deformed up to the last frame.

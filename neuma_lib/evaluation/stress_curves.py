@@ -4,8 +4,6 @@ Simulated lengths are ``scale`` times those of the room. Times and densities are
 simulated one divided by the square of the scale.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -26,8 +24,7 @@ TESTS = {
 """Axes of the panels, from top to bottom."""
 VISITED = "#d9e6ef"
 """Colour of the visited ranges."""
-HEADROOM = 0.6
-"""Limit of the curve of a law without error bars beyond the others, relative to their range."""
+HEADROOM = 0.6  # limit of the curve of a law without error bars beyond the others, relative to their range
 
 
 def stress_curves(

@@ -1,7 +1,5 @@
 """Plain tables as CSV and Markdown."""
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Iterable, Mapping, Sequence

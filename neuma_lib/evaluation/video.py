@@ -1,7 +1,5 @@
 """Videos of prediction and observation side by side, as mp4 or gif."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,10 +10,8 @@ from PIL import Image, ImageDraw, ImageFont
 from neuma_lib.errors import InputError
 from neuma_lib.extras import require
 
-_LABEL_HEIGHT = 18
-"""Line of text above each panel [px]."""
-_GIF_RATE = 50
-"""Maximum frames per second of a GIF. Browsers replace delays below 20 ms by 100 ms."""
+_LABEL_HEIGHT = 18  # line of text above each panel [px]
+_GIF_RATE = 50  # maximum frames per second of a GIF. Browsers replace delays below 20 ms by 100 ms.
 _REPEATABLE = ("-fflags", "+bitexact", "-flags:v", "+bitexact", "-threads", "1", "-map_metadata", "-1")
 """Encoder options that make the file reproducible: no versions, no dates, one thread."""
 
@@ -25,7 +21,6 @@ def side_by_side(panels: Sequence[np.ndarray], labels: Sequence[str], magnify: i
 
     Args:
         panels: videos (T, H, W, 3) in [0, 1] of one length and height.
-        labels: one for each video.
         magnify: integer factor of enlargement.
 
     Returns:

@@ -1,7 +1,5 @@
 """Laws of this project as materials of other engines, with what is known of them, and back."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

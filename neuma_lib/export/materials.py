@@ -6,8 +6,6 @@ sqrt(2) (yield_stress + friction p), since its stress is a vector whose squared 
 engines sum stresses over the volume of undeformed particles or elements.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -20,12 +18,10 @@ UNBOUNDED = 1e12
 """Yield stress of a newton material that never yields, and pressure at which it is crushed [Pa]."""
 MAX_RELAXATION = 0.01
 """Longest relaxation time of the shear of a viscous law that a fluid without elastic shear replaces [s]."""
-_SAME_MODULI = 1e-6
-"""Relative difference up to which moduli of both parts of a law are equal."""
+_SAME_MODULI = 1e-6  # relative difference up to which moduli of both parts of a law are equal
 
 Values = dict[str, float]
-Names = tuple[str, str]
-"""Of the elasticity and of the plasticity."""
+Names = tuple[str, str]  # of the elasticity and of the plasticity
 Arguments = dict[str, float | str | bool]
 
 

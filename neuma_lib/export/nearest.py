@@ -1,7 +1,5 @@
 """The nearest law of another engine to any law, over the states that it has visited."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,12 +16,9 @@ from neuma_lib.export.materials import RULES, check_engine, engine_material
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.law import Law
 
-MAX_ERROR = 0.1
-"""Largest relative stress error of a fit that is accepted without force."""
-MAX_STATES = 1000
-"""Approximate number of the visited states that are compared."""
-INCREMENT = 0.1
-"""Strain of a trial state, relative to the visited strains."""
+MAX_ERROR = 0.1  # largest relative stress error of a fit that is accepted without force
+MAX_STATES = 1000  # approximate number of the visited states that are compared
+INCREMENT = 0.1  # strain of a trial state, relative to the visited strains
 _STARTS: dict[str, dict[str, Sequence[float]]] = {
     "identity": {},
     "fluid_projection": {},
@@ -37,15 +32,11 @@ to that stress over a rate of one visited strain in 100 steps."""
 
 @dataclass(frozen=True)
 class Fit:
-    """A law that an engine has, fitted to another law.
+    """A law that an engine has, fitted to another law."""
 
-    Attributes:
-        spec: its specification.
-        errors: root mean square of the stress error over that of the stress, in the visited elastic states
-            (``stress``) and after the return map of trial states (``returned``).
-    """
-
-    spec: dict[str, Any]
+    spec: dict[str, Any]  # its specification
+    # root mean square of the stress error over that of the stress, in the visited elastic states (``stress``)
+    # and after the return map of trial states (``returned``)
     errors: dict[str, float]
 
     @property
@@ -60,7 +51,6 @@ def nearest(law: Law, states: Tensor, engine: str, dt: float) -> Fit:
     after the return of trial states, which are visited states with random increments of strain (`INCREMENT`).
 
     Args:
-        law: any law.
         states: elastic deformation gradients that it has visited, (N, 3, 3).
         engine: one of `neuma_lib.export.materials.ENGINES`.
         dt: time step [s].

@@ -32,8 +32,7 @@ MAX_UNEVEN, MAX_SPREAD = 1e-3, 0.2
 """Largest relative difference of densities that count as one, and standard deviation of volumes over their mean."""
 SCENE_FILES = {"newton": "scene.usda", "mujoco": "scene.xml"}
 """File of a scene that an engine loads itself. A script builds those of Genesis."""
-STICKS = 1e3
-"""Coulomb coefficient of a floor on which nothing slides."""
+STICKS = 1e3  # Coulomb coefficient of a floor on which nothing slides
 SAMPLE_EDGE, SAMPLE_COUNT, SAMPLE_HEIGHT = 0.2, 16, 0.1
 """Edge [m], particles along it, and height above the floor [m] of the cube in the file of a law alone."""
 _KUHN = np.array([[0, 4, 6, 7], [0, 5, 4, 7], [0, 6, 2, 7], [0, 2, 3, 7], [0, 1, 5, 7], [0, 3, 1, 7]])
@@ -42,32 +41,23 @@ _KUHN = np.array([[0, 4, 6, 7], [0, 5, 4, 7], [0, 6, 2, 7], [0, 2, 3, 7], [0, 1,
 
 @dataclass(frozen=True)
 class EngineScene:
-    """A body above the floor y = 0.
+    """A body above the floor y = 0."""
 
-    Attributes:
-        x, v: positions [m] and velocities [m/s] of the particles, (N, 3).
-        mass, vol0: masses [kg] and undeformed volumes [m^3] of the particles, (N,).
-        dt: time step [s].
-        steps, every: number of steps, and steps from one recorded state to the next.
-        grid: cells per metre.
-        gravity: [m/s^2].
-        friction: Coulomb coefficient of the floor.
-        colors: linear colours of the particles in [0, 1], (N, 3), or None.
-        notes: what of the scene is not carried over.
-    """
-
+    # x, v: positions [m] and velocities [m/s] of the particles, (N, 3)
     x: np.ndarray
     v: np.ndarray
+    # mass, vol0: masses [kg] and undeformed volumes [m^3] of the particles, (N,)
     mass: np.ndarray
     vol0: np.ndarray
-    dt: float
+    dt: float  # time step [s]
+    # steps, every: number of steps, and steps from one recorded state to the next
     steps: int
     every: int
-    grid: int
-    gravity: tuple[float, float, float] = (0.0, -9.8, 0.0)
-    friction: float = STICKS
-    colors: np.ndarray | None = None
-    notes: tuple[str, ...] = ()
+    grid: int  # cells per metre
+    gravity: tuple[float, float, float] = (0.0, -9.8, 0.0)  # [m/s^2]
+    friction: float = STICKS  # Coulomb coefficient of the floor
+    colors: np.ndarray | None = None  # linear colours of the particles in [0, 1], (N, 3), or None
+    notes: tuple[str, ...] = ()  # what of the scene is not carried over
 
     @classmethod
     def of(

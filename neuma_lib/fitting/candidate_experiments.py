@@ -1,7 +1,5 @@
 """Experiments that a lab could do next with an object: launch it, press it, hang it, or film it from elsewhere."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -54,21 +52,14 @@ REJECTIONS = {
 
 @dataclass(frozen=True)
 class Start:
-    """The start of an experiment with the body.
+    """The start of an experiment with the body."""
 
-    Attributes:
-        settings: of its scene, in plain values. Colliders are in addition to those of the existing one.
-        model: simulator constants, with its colliders and clamps.
-        body: the body at the start.
-        motion: its initial motion.
-        steps: simulated steps of its video.
-    """
-
+    # of its scene, in plain values. Colliders are in addition to those of the existing one.
     settings: dict[str, Any]
-    model: MPM
-    body: Reconstruction
-    motion: InitialMotion
-    steps: int
+    model: MPM  # simulator constants, with its colliders and clamps
+    body: Reconstruction  # the body at the start
+    motion: InitialMotion  # its initial motion
+    steps: int  # simulated steps of its video
 
 
 def placed(body: Reconstruction, rotation: np.ndarray, centre: Sequence[float]) -> Reconstruction:
@@ -126,9 +117,6 @@ def draw_starts(
         body: the body at the start of the existing video.
         motion: initial motion of the existing video, whose standard deviations the others have, too.
         steps: steps of its video.
-        lab: limits.
-        count: number of starts.
-        seed: of the sequence.
         kind: one of `STARTS`.
 
     Raises:

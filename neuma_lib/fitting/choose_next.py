@@ -1,7 +1,5 @@
 """Rank what could be filmed next with an object whose material has been identified."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -38,54 +36,38 @@ from neuma_lib.sim.state import Trajectory
 from neuma_lib.splatting.observation import joint_frames
 from neuma_lib.splatting.viewpoints import video_views
 
-MIN_GAIN = 0.05
-"""Relative decrease of what is ranked below which an experiment is useless."""
+MIN_GAIN = 0.05  # relative decrease of what is ranked below which an experiment is useless
 _LENGTHS = ("height", "center", "velocity", "size", "lowest", "highest")  # settings with lengths [m] or [m/s]
 _IDENTIFY = "Run `snakemake --cores 2 results/<scene>/identified.json` first"
 
 
 @dataclass(frozen=True)
 class Option:
-    """An experiment that could be done next.
+    """An experiment that could be done next."""
 
-    Attributes:
-        kind: one of `NextConfig.kinds`.
-        settings: of its scene, or of the camera.
-        forecast: its expected result.
-        after: what is ranked, after the experiment (`Selection.goal`); smaller is better.
-        prediction: expected standard deviation of the chosen motion [m], or None.
-        experiment, path: what would be filmed, and its motion with the identified constants.
-    """
-
-    kind: str
-    settings: dict[str, Any]
-    forecast: Forecast
-    after: float
-    prediction: float | None
+    kind: str  # one of `NextConfig.kinds`
+    settings: dict[str, Any]  # of its scene, or of the camera
+    forecast: Forecast  # its expected result
+    after: float  # what is ranked, after the experiment (`Selection.goal`); smaller is better
+    prediction: float | None  # expected standard deviation of the chosen motion [m], or None
+    # experiment, path: what would be filmed, and its motion with the identified constants
     experiment: Experiment
     path: Trajectory
 
 
 @dataclass(frozen=True)
 class Selection:
-    """Options for the next experiment, the best first.
+    """Options for the next experiment, the best first."""
 
-    Attributes:
-        goal: what is ranked: "prediction", its standard deviation [m]; "constants", the geometric mean of the standard
-            deviations of their logarithms; or "families", the probability of the rival relative to the identified one.
-        before: it, with what is known.
-        known: the identified family with what is known.
-        prediction: standard deviation of the chosen motion [m] with what is known, or None.
-        options: ranked.
-        failed: number of candidates whose simulation diverged.
-    """
-
+    # what is ranked: "prediction", its standard deviation [m]; "constants", the geometric mean of the
+    # standard deviations of their logarithms; or "families", the probability of the rival relative to the
+    # identified one
     goal: str
-    before: float
-    known: FamilyFit
-    prediction: float | None
-    options: list[Option]
-    failed: int
+    before: float  # it, with what is known
+    known: FamilyFit  # the identified family with what is known
+    prediction: float | None  # standard deviation of the chosen motion [m] with what is known, or None
+    options: list[Option]  # ranked
+    failed: int  # number of candidates whose simulation diverged
     settings: IdentifyConfig
 
     def gain(self, option: Option) -> float:
@@ -207,7 +189,6 @@ def choose_next(
         derivatives: of the motion to predict, see `motion_derivatives`, or None.
         reframe: whether the cameras are those of a rendered scene, which are placed so that they see the whole motion.
             They are fixed otherwise.
-        seed: of the candidates.
         progress: called with (finished candidates, their number).
         log: receives a line for each candidate.
 

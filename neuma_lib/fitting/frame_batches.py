@@ -4,8 +4,6 @@ For renders of 400 frames, autograd would keep tens of gigabytes until the backw
 the gradients with respect to the states batch by batch, and the backward pass only weights them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import pairwise
 
@@ -89,7 +87,6 @@ def held_out_frames(count: int, share: float, blocks: int = 1, contact: int = 0)
     Args:
         count: number of frames of the video.
         share: share of the frames after the contact.
-        blocks: number of blocks.
         contact: index of the first informative frame. Earlier frames are ignored unless fewer than two remain.
     """
     first = contact if count - contact >= 2 else 0

@@ -60,10 +60,8 @@ _BETAS, _EPS = (0.9, 0.99), 1e-15
 """Betas and epsilon of Adam (3DGS uses 0.9, 0.999, but fits here are 20 times shorter)."""
 _MEANS_DECAY, _RATE_DECAY = 0.01, 0.1
 """Ratio of last to first learning rate for centres (as in 3DGS) and for all other parameters."""
-_SPLIT_SHRINK = 1.6
-"""Ratio of the standard deviations of a Gaussian before and after a split, as in 3DGS."""
-_CLONE_OFFSET = 0.5
-"""Ratio of the offset of a clone to that of a split."""
+_SPLIT_SHRINK = 1.6  # ratio of the standard deviations of a Gaussian before and after a split, as in 3DGS
+_CLONE_OFFSET = 0.5  # ratio of the offset of a clone to that of a split
 
 
 def fit_gaussians(

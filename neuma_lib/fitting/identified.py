@@ -20,34 +20,24 @@ _ASYMPTOTIC = math.log(2)
 
 @dataclass
 class FamilyFit:
-    """Fit of a family.
+    """Fit of a family."""
 
-    Attributes:
-        family: the candidate.
-        values: its constants, or those of the last start if every rollout diverged.
-        loss: mean squared residual of the fitted frames at the last level of the pyramid, infinite if all diverged.
-        held_out: mean squared residual of the held-out frames at the finest level.
-        score: logarithm of ``held_out`` plus the penalty on constants; lower is better.
-        covariance: covariance (k, k) of the unbounded constants, including the uncertainty of the initial motions.
-        laplace: the same by the Laplace approximation, with independent pixels: inverse curvature times ``loss``.
-        motions: fitted initial motion in each video, with its standard deviations.
-        refined: whether the fit reached the finest level.
-        rollouts: number of simulations.
-        steps: number of accepted Levenberg-Marquardt steps.
-        lowest_friction: lower bound of the Coulomb coefficient of a body that may stick, whose family is without it.
-    """
-
-    family: Family
-    values: Values
+    family: Family  # the candidate
+    values: Values  # its constants, or those of the last start if every rollout diverged
+    # mean squared residual of the fitted frames at the last level of the pyramid, infinite if all diverged
     loss: float = math.inf
-    held_out: float = math.inf
-    score: float = math.inf
+    held_out: float = math.inf  # mean squared residual of the held-out frames at the finest level
+    score: float = math.inf  # logarithm of ``held_out`` plus the penalty on constants; lower is better
+    # covariance (k, k) of the unbounded constants, including the uncertainty of the initial motions
     covariance: np.ndarray | None = None
+    # the same by the Laplace approximation, with independent pixels: inverse curvature times ``loss``
     laplace: np.ndarray | None = None
+    # fitted initial motion in each video, with its standard deviations
     motions: tuple[InitialMotion, ...] = ()
-    refined: bool = False
-    rollouts: int = 0
-    steps: int = 0
+    refined: bool = False  # whether the fit reached the finest level
+    rollouts: int = 0  # number of simulations
+    steps: int = 0  # number of accepted Levenberg-Marquardt steps
+    # lower bound of the Coulomb coefficient of a body that may stick, whose family is without it
     lowest_friction: float | None = None
 
     def contact_friction(self, settings: IdentifyConfig) -> dict[str, float]:
@@ -174,30 +164,22 @@ class FamilyFit:
 
 @dataclass
 class Identified:
-    """Result of `identify`.
+    """Result of `identify`."""
 
-    Attributes:
-        best: the selected family, fitted to all frames on the grid of the simulation. It predicts on that grid.
-        ties: names of other families with an equal score.
-        compared: names of the families whose scores are compared, which all have the same grid.
-        fits: all candidates at their evaluation, by name, on the finer grid where families were compared there.
-        frames: steps of the fitted frames of each video.
-        held_out: steps of the held-out frames of each video.
-        rollouts: number of simulations, some of which families share.
-        grid: cells along the unit cube of the simulation.
-        material: the selected family with its constants extrapolated to a cell size of zero, for other simulators and
-            data sheets. None without a second grid.
-    """
-
+    # the selected family, fitted to all frames on the grid of the simulation. It predicts on that grid.
     best: FamilyFit
-    ties: list[str]
+    ties: list[str]  # names of other families with an equal score
+    # all candidates at their evaluation, by name, on the finer grid where families were compared there
     fits: dict[str, FamilyFit]
-    frames: list[tuple[int, ...]]
-    held_out: list[tuple[int, ...]]
-    rollouts: int
-    grid: int
+    frames: list[tuple[int, ...]]  # steps of the fitted frames of each video
+    held_out: list[tuple[int, ...]]  # steps of the held-out frames of each video
+    rollouts: int  # number of simulations, some of which families share
+    grid: int  # cells along the unit cube of the simulation
     settings: IdentifyConfig = field(repr=False)
+    # the selected family with its constants extrapolated to a cell size of zero, for other simulators and
+    # data sheets. None without a second grid.
     material: FamilyFit | None = None
+    # names of the families whose scores are compared, which all have the same grid
     compared: Sequence[str] = ()
 
     def as_dict(self) -> dict[str, Any]:

@@ -33,8 +33,6 @@ that the body sticks, the result is a lower bound of the coefficient.
 Several videos of one material share the constants, have one initial motion each, and equal weights.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any

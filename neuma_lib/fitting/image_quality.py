@@ -1,7 +1,5 @@
 """Loss and PSNR of rendered images, as in 3D Gaussian Splatting."""
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """Initial Gaussians of a static fit: points sampled in the visual hull, with colours from the images."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 
@@ -14,12 +12,9 @@ from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.splatting.spherical_harmonics import coefficient_count, rgb_to_sh0
 
-_SHEET_PACKING = 1.15
-"""Squared spacing per area of a point in a hexagonal sheet, 2 / sqrt(3) rounded."""
-_VOLUME_PACKING = 1.41
-"""Cubed spacing per volume of a point in close packing, sqrt(2) rounded."""
-START_SCALE = 0.5
-"""Initial standard deviation relative to the spacing."""
+_SHEET_PACKING = 1.15  # squared spacing per area of a point in a hexagonal sheet, 2 / sqrt(3) rounded
+_VOLUME_PACKING = 1.41  # cubed spacing per volume of a point in close packing, sqrt(2) rounded
+START_SCALE = 0.5  # initial standard deviation relative to the spacing
 _COLOUR_DEPTHS = 0.05
 """Decay length of the weights of cameras in the initial colours, as a share of the mean depth."""
 
@@ -34,9 +29,7 @@ def initial_gaussians(
     """Isotropic Gaussians, mostly near the surface of the hull, and their mean spacing [m].
 
     Args:
-        hull: visual hull of the masks.
         images: RGBA images (H, W, 4), for the colours.
-        cameras: their cameras.
         settings: counts, opacity and degree of the harmonics.
         generator: source of the random positions.
     """

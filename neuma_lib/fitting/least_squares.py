@@ -3,8 +3,6 @@
 Images are reduced to sums J^T J and J^T r per block, so that blocks can be left out afterwards.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -14,10 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-BLOCKS = 4
-"""Blocks along a side of the image for the jackknife."""
-MIN_COST = 1e-12
-"""Lower bound of the cost, so that exact agreement does not make the equations singular."""
+BLOCKS = 4  # blocks along a side of the image for the jackknife
+MIN_COST = 1e-12  # lower bound of the cost, so that exact agreement does not make the equations singular
 _MIN_SHARE = 1e-6  # share of the curvature of a block that shows the body
 _FIRST_DAMPING, _MIN_DAMPING, _MAX_DAMPING = 1e-3, 1e-9, 1e6
 _SECANT_DAMPING = 0.03  # at least, with an updated J, which is inaccurate where the images change little
@@ -27,20 +23,13 @@ _ROUGH_GAIN = 0.05  # predicted relative gain of a failed step that ends a rough
 
 @dataclass(frozen=True)
 class Linearisation:
-    """The linearised least-squares problem with residuals r and Jacobian J, summed over pixels.
+    """The linearised least-squares problem with residuals r and Jacobian J, summed over pixels."""
 
-    Attributes:
-        curvatures: J^T J of every block of the image, summed over frames, shape (blocks, k, k).
-        scores: J^T r of every block, shape (blocks, k).
-        cost: r^T r.
-        rms: root mean square of r.
-        exact: whether J has been differentiated here, instead of updated from a former point (`secant_update`).
-    """
-
-    curvatures: np.ndarray
-    scores: np.ndarray
-    cost: float
-    rms: float
+    curvatures: np.ndarray  # J^T J of every block of the image, summed over frames, shape (blocks, k, k)
+    scores: np.ndarray  # J^T r of every block, shape (blocks, k)
+    cost: float  # r^T r
+    rms: float  # root mean square of r
+    # whether J has been differentiated here, instead of updated from a former point (`secant_update`)
     exact: bool = True
 
     @property

@@ -50,25 +50,18 @@ from neuma_lib.sim.state import State
 from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.observation import Observation
 
-_NOISE_RANGE = 1e12
-"""Largest ratio of the noise to the mean curvature, and its inverse."""
+_NOISE_RANGE = 1e12  # largest ratio of the noise to the mean curvature, and its inverse
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """A motion of the body that has been filmed, or could be.
+    """A motion of the body that has been filmed, or could be."""
 
-    Attributes:
-        model: simulator constants, with the obstacles and clamps of the experiment.
-        motion: initial motion, with the standard deviations that an estimate before contact has or would have.
-        body: the body in its initial pose.
-        video: frames and cameras. Images are not used.
-    """
-
-    model: MPM
+    model: MPM  # simulator constants, with the obstacles and clamps of the experiment
+    # initial motion, with the standard deviations that an estimate before contact has or would have
     motion: InitialMotion
-    body: Reconstruction
-    video: Sequence[Observation]
+    body: Reconstruction  # the body in its initial pose
+    video: Sequence[Observation]  # frames and cameras. Images are not used.
 
     def residuals(self, settings: IdentifyConfig) -> VideoResiduals:
         return VideoResiduals(self.model, self.motion, self.body, self.video, settings)
@@ -82,16 +75,11 @@ def unfilmed(frames: Sequence[int], cameras: Cameras) -> Observation:
 
 @dataclass(frozen=True)
 class Forecast:
-    """Expected result of an experiment.
+    """Expected result of an experiment."""
 
-    Attributes:
-        fit: the identified family with the expected covariance of its unbounded constants.
-        information: that of the experiment alone on the unbounded constants, shape (k, k).
-        evidence: expected logarithm of the Bayes factor of the identified family against each rival, by name.
-    """
-
-    fit: FamilyFit
-    information: np.ndarray
+    fit: FamilyFit  # the identified family with the expected covariance of its unbounded constants
+    information: np.ndarray  # that of the experiment alone on the unbounded constants, shape (k, k)
+    # expected logarithm of the Bayes factor of the identified family against each rival, by name
     evidence: dict[str, float]
 
 
@@ -106,17 +94,11 @@ class _Rival:
 
 @dataclass
 class Knowledge:
-    """Results of the identification in existing videos, and the forecast of a further experiment.
+    """Results of the identification in existing videos, and the forecast of a further experiment."""
 
-    Attributes:
-        fit: the identified family and constants, with the covariance of the unbounded ones.
-        settings: those of the identification.
-        noise: variance s^2 of the residuals per unit of curvature.
-    """
-
-    fit: FamilyFit
-    settings: IdentifyConfig
-    noise: float
+    fit: FamilyFit  # the identified family and constants, with the covariance of the unbounded ones
+    settings: IdentifyConfig  # those of the identification
+    noise: float  # variance s^2 of the residuals per unit of curvature
     _rivals: list[_Rival] = field(default_factory=list)
 
     @classmethod

@@ -1,7 +1,5 @@
 """Random motions of cubes in a box, on which priors are trained and evaluated."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -20,20 +18,13 @@ from neuma_lib.sim.state import State
 
 Progress = Callable[[int, int, float | None], None]
 """Receives the number of finished iterations, the total number, and the loss."""
-DENSITY = 1000.0
-"""Density of every training cube [kg/m^3]."""
-_COURANT = 0.5
-"""Maximum Courant number."""
-_SIDES = (0.15, 0.35)
-"""Range of the sides of random cubes [m], in a box with a side of 1 m."""
-_WALL_CLEARANCE = 0.1
-"""Initial distance of the bounding sphere of a cube from the walls [m]."""
-_LOWEST = 0.3
-"""Lowest share of the possible initial heights that is used, so that cubes hit the floor soon."""
-_VELOCITIES = ((-2.0, 2.0), (-4.0, -0.5), (-2.0, 2.0))
-"""Ranges of the velocity along x, y and z [m/s]."""
-_SPIN = 6.0
-"""Largest angular velocity about each axis [rad/s]."""
+DENSITY = 1000.0  # density of every training cube [kg/m^3]
+_COURANT = 0.5  # maximum Courant number
+_SIDES = (0.15, 0.35)  # range of the sides of random cubes [m], in a box with a side of 1 m
+_WALL_CLEARANCE = 0.1  # initial distance of the bounding sphere of a cube from the walls [m]
+_LOWEST = 0.3  # lowest share of the possible initial heights that is used, so that cubes hit the floor soon
+_VELOCITIES = ((-2.0, 2.0), (-4.0, -0.5), (-2.0, 2.0))  # ranges of the velocity along x, y and z [m/s]
+_SPIN = 6.0  # largest angular velocity about each axis [rad/s]
 
 
 @dataclass(frozen=True)

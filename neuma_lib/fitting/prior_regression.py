@@ -9,8 +9,6 @@ are therefore tested on faster motions than those of the training. If they crush
 longer round with the states of these motions follows. The test does not change priors that pass.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -40,22 +38,15 @@ _AS_VISITED = 0.5
 """Share of the training stretches that rollouts visited, from which the units of a network are computed."""
 _PURE_NOISE = 0.1
 """Share of the training stretches that are purely random, which covers states far from any rollout."""
-_LOG_STRETCHES = (-2.0, 1.5)
-"""Range of the logarithms of the training stretches, which are 0.14 to 4.5."""
+_LOG_STRETCHES = (-2.0, 1.5)  # range of the logarithms of the training stretches, which are 0.14 to 4.5
 _TEST_SEEDS = 30_000
 """Offset of the seed for tests, so that their motions differ from those of training and evaluation."""
-_TEST_SPEED = 1.25
-"""Speed factor of the motions in tests, so that unseen motions stay within the data."""
-_LONGER = 3
-"""Factor of the iterations in an additional round, whose data are more diverse."""
-_WARM_UP = 0.05
-"""Share of the iterations in which the learning rate rises."""
-_GRADIENT_CLIP = 1.0
-"""Largest gradient norm of a network in normalised units."""
-_LAST_PART = 10
-"""The reported loss is the mean over the last 1 / `_LAST_PART` of the iterations."""
-_REPORT_EVERY = 50
-"""Iterations between progress reports."""
+_TEST_SPEED = 1.25  # speed factor of the motions in tests, so that unseen motions stay within the data
+_LONGER = 3  # factor of the iterations in an additional round, whose data are more diverse
+_WARM_UP = 0.05  # share of the iterations in which the learning rate rises
+_GRADIENT_CLIP = 1.0  # largest gradient norm of a network in normalised units
+_LAST_PART = 10  # the reported loss is the mean over the last 1 / `_LAST_PART` of the iterations
+_REPORT_EVERY = 50  # iterations between progress reports
 
 
 def train_by_regression(

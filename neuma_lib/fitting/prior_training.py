@@ -4,8 +4,6 @@ A regression (`neuma_lib.fitting.prior_regression`) fits a pair of networks to a
 compared with those of the law on unseen motions.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 
@@ -19,10 +17,8 @@ from neuma_lib.geometry.chamfer import chamfer_sequence
 from neuma_lib.mechanics.law import Law
 from neuma_lib.mechanics.neural import NeuralLaw
 
-METHOD = "regression"
-"""Training method stored in the files of priors."""
-CLOSE = 0.1
-"""Chamfer distance between prior and law of the best priors of the authors [1e-4 m^2]."""
+METHOD = "regression"  # training method stored in the files of priors
+CLOSE = 0.1  # Chamfer distance between prior and law of the best priors of the authors [1e-4 m^2]
 _EVALUATION_SEEDS = 10_000
 """Offset of the seed for evaluation, so that its motions differ from those of the training."""
 
@@ -37,7 +33,6 @@ def train_prior(
 
     Args:
         spec: the analytic law, see :func:`neuma_lib.mechanics.analytic.analytic_law`.
-        settings: settings of the regression.
         seed: seed of motions, noise, initial weights and batches.
         progress: called with (finished iterations, all iterations, loss).
 

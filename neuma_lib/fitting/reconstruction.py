@@ -1,7 +1,5 @@
 """Reconstruct a body from images of it at rest: Gaussians, surface, particles, binding (paper Sec. 3.1-3.4)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal

@@ -8,8 +8,6 @@ function theorem, and by all unknowns at a fixed nearest point of the outline, s
 outline.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field

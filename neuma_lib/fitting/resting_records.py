@@ -1,7 +1,5 @@
 """Stiffness over density of a body from all stills of a record, under each clamp, on two meshes."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -25,8 +23,7 @@ Progress = Callable[[int, int], None]
 
 SURFACE = 0.005
 """Edge of the triangles of the surface [m]. On a beam that bends with a radius of 10 cm, chords are 0.03 mm inside."""
-FIRST_RATIO = 60.0
-"""mu / rho before the fit [m^2/s^2]. Fits from 30 to 200 end at the same value."""
+FIRST_RATIO = 60.0  # mu / rho before the fit [m^2/s^2]. Fits from 30 to 200 end at the same value.
 _MODULUS = 100.0  # Pa
 
 

@@ -7,8 +7,6 @@ part separates stiffness at rest, which the sag shows, from that in motion and f
 The simulation damps as well. `numerical_damping` measures it with the same law without its viscous part.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -29,8 +27,7 @@ from neuma_lib.fitting.vibration import Vibration, fit_vibration
 from neuma_lib.mechanics.combinations import Values
 from neuma_lib.mechanics.law import Law
 
-FRAME = 2.5e-3
-"""Interval of simulated frames [s], between which a cubic spline interpolates."""
+FRAME = 2.5e-3  # interval of simulated frames [s], between which a cubic spline interpolates
 _END = 0.6  # share of the length beyond which markers are
 _NEIGHBOURS = 200  # particles whose affine motion a marker follows
 _DIFFERENCE = 0.03  # of unbounded constants
@@ -41,30 +38,19 @@ _EARLY = 0.02  # frames before the release that are compared [s]
 
 @dataclass(frozen=True)
 class Record:
-    """A released beam that was recorded.
+    """A released beam that was recorded."""
 
-    Attributes:
-        name: for results.
-        tracks: in axes along the beam, up and sideways, from before the release on.
-        load: mass at its free end [kg].
-    """
-
-    name: str
-    tracks: MarkerTracks
-    load: float = 0.0
+    name: str  # for results
+    tracks: MarkerTracks  # in axes along the beam, up and sideways, from before the release on
+    load: float = 0.0  # mass at its free end [kg]
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where the beam is in the axes of the records, and how well that is known, as (value, standard deviation) [m].
+    """Where the beam is in the axes of the records, and how well that is known, as (value, standard deviation) [m]."""
 
-    Attributes:
-        root: coordinate along, of the end of the clamp.
-        axis: height of the axis of the beam at the clamp.
-    """
-
-    root: tuple[float, float]
-    axis: tuple[float, float]
+    root: tuple[float, float]  # coordinate along, of the end of the clamp
+    axis: tuple[float, float]  # height of the axis of the beam at the clamp
 
 
 @dataclass(frozen=True)
@@ -92,27 +78,19 @@ class RecordFit:
 
 @dataclass(frozen=True)
 class SpecimenFit:
-    """Result of `fit_specimen`.
+    """Result of `fit_specimen`."""
 
-    Attributes:
-        family: of the law.
-        values: its constants.
-        log_std: standard deviations of the logarithms of its constants, for residuals of equal size that are
-            independent between records only. They do not include errors of the grid and of the clamp.
-        root, axis: see `Place` [m].
-        records: agreement of the records.
-        cost: sum of squared residuals in units of ``noise``.
-        evaluations: number of simulated beams.
-    """
-
-    family: Family
-    values: Values
+    family: Family  # of the law
+    values: Values  # its constants
+    # standard deviations of the logarithms of its constants, for residuals of equal size that are independent
+    # between records only. They do not include errors of the grid and of the clamp.
     log_std: dict[str, float]
+    # root, axis: see `Place` [m]
     root: float
     axis: float
-    records: list[RecordFit]
-    cost: float
-    evaluations: int
+    records: list[RecordFit]  # agreement of the records
+    cost: float  # sum of squared residuals in units of ``noise``
+    evaluations: int  # number of simulated beams
 
     def as_dict(self) -> dict[str, Any]:
         """Constants, place and agreement, for JSON."""

@@ -10,8 +10,6 @@ A correction cannot change the kind of its base: an elastic base never flows, an
 If the constants alone do not distinguish such families, corrections of rivals are compared in the same way.
 """
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -324,16 +322,11 @@ def _compared(score: Score, other: Score) -> str:
 
 @dataclass
 class _Stage:
-    """Checkpoint of one of several trainings, including the results of the previous ones.
-
-    Attributes:
-        trials: scores of finished trials.
-        states: trained laws and the memory of their trainings by base.
-    """
+    """Checkpoint of one of several trainings, including the results of the previous ones."""
 
     whole: Checkpoint
-    trials: dict[str, dict[str, float]]
-    states: dict[int, dict[str, Any]]
+    trials: dict[str, dict[str, float]]  # scores of finished trials
+    states: dict[int, dict[str, Any]]  # trained laws and the memory of their trainings by base
 
     def load(self) -> dict[str, Any] | None:
         """The state of this training, or None if the checkpoint belongs to another."""

@@ -9,8 +9,6 @@ The body starts in equilibrium with what holds it, on the mesh of quadratic elem
 fitted. A vibration of angular frequency w then has a damping ratio of w / 2 times that time, and the simulation's own.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -47,14 +45,11 @@ from neuma_lib.sim.equilibrium import extrapolated
 
 Array = NDArray[np.float64]
 
-FRAME = 5e-3
-"""Interval of simulated frames [s], between which a cubic spline interpolates."""
-FIRST_SHARE = 0.6
-"""Share of the weight that is held, before the fit."""
+FRAME = 5e-3  # interval of simulated frames [s], between which a cubic spline interpolates
+FIRST_SHARE = 0.6  # share of the weight that is held, before the fit
 FIRST_RELEASES = (0.0, 0.03, 0.06)
 """Times of release after the first photograph before the fit [s], of which the best is the start."""
-FIRST_RETARDATION = 5e-3
-"""Retardation time before it is fitted [s]."""
+FIRST_RETARDATION = 5e-3  # retardation time before it is fitted [s]
 FITS = {"predicted": (), "fitted": (RATIO,)}
 """Results of a swing on each grid, and the numbers of the shape that each fits in addition to share and release."""
 _NEIGHBOURS = 40  # particles whose affine motion a point of the surface follows
@@ -64,19 +59,12 @@ _VIBRATION = 4.0  # simulated time for the damping, in durations of the swing
 
 @dataclass(frozen=True, eq=False)
 class Swing:
-    """Motions of a body that is released from an equilibrium, of which the last ones are kept.
+    """Motions of a body that is released from an equilibrium, of which the last ones are kept."""
 
-    Attributes:
-        resting: the body before the release, with its region `held`.
-        spec: its elastic law as plain values.
-        dx: edge of a cell [m].
-        duration: simulated time after the release [s].
-    """
-
-    resting: RestingBody
-    spec: Mapping[str, Any]
-    dx: float
-    duration: float
+    resting: RestingBody  # the body before the release, with its region `held`
+    spec: Mapping[str, Any]  # its elastic law as plain values
+    dx: float  # edge of a cell [m]
+    duration: float  # simulated time after the release [s]
     _paths: dict = field(default_factory=dict)
 
     def path(self, ratio: float, share: float, retardation: float = 0.0) -> CubicSpline:

@@ -1,7 +1,5 @@
 """Common base of training loops: Adam with a schedule, recovery from divergence, and checkpoints."""
 
-from __future__ import annotations
-
 import copy
 import math
 from abc import ABC, abstractmethod

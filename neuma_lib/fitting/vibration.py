@@ -1,7 +1,5 @@
 """Frequency and damping of a vibration that dies away."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -11,20 +9,14 @@ from scipy.optimize import least_squares
 
 @dataclass(frozen=True)
 class Vibration:
-    """x(t) = rest + amplitude exp(-damping w t) cos(w t + phase) with w = 2 pi frequency.
+    """x(t) = rest + amplitude exp(-damping w t) cos(w t + phase) with w = 2 pi frequency."""
 
-    Attributes:
-        rest, amplitude: in the unit of x.
-        frequency: [Hz].
-        damping: ratio of the decay rate to w.
-        phase: [rad].
-    """
-
+    # rest, amplitude: in the unit of x
     rest: float
     amplitude: float
-    frequency: float
-    damping: float
-    phase: float
+    frequency: float  # [Hz]
+    damping: float  # ratio of the decay rate to w
+    phase: float  # [rad]
 
 
 def fit_vibration(times: np.ndarray, values: np.ndarray) -> Vibration:

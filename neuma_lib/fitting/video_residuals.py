@@ -6,8 +6,6 @@ the apparent material, so a second discretisation, with a finer grid, shorter ti
 simulated instead.
 """
 
-from __future__ import annotations
-
 import math
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -35,10 +33,8 @@ from neuma_lib.splatting.observation import Observation, joint_frames, rendered_
 from neuma_lib.splatting.spherical_harmonics import rgb_to_sh0
 from neuma_lib.threads import in_threads
 
-MOTION = 6
-"""Number of unknowns of an initial motion: velocity and spin."""
-NUISANCES = 9
-"""`MOTION`, and shift right, shift down and enlargement of the rendered body, for each body."""
+MOTION = 6  # number of unknowns of an initial motion: velocity and spin
+NUISANCES = 9  # `MOTION`, and shift right, shift down and enlargement of the rendered body, for each body
 _KEPT = 4  # flights of different motions, and their images
 
 

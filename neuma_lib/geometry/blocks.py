@@ -1,7 +1,5 @@
 """Quadratic hexahedra of a solid that consists of blocks."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Chamfer distance of two point sets, as a metric (paper Sec. 4.1) and as a loss."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch
@@ -10,8 +8,7 @@ from torch import Tensor
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.geometry.nearest import nearest
 
-CHAMFER_SCALE = 1e4
-"""Factor of squared metres in the paper's unit."""
+CHAMFER_SCALE = 1e4  # factor of squared metres in the paper's unit
 
 
 def chamfer_sequence(a: Tensor, b: Tensor) -> Tensor:

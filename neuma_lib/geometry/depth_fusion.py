@@ -1,7 +1,5 @@
 """Fusion of depth maps to a signed distance (Curless and Levoy 1996), which resolves dents invisible in silhouettes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

@@ -1,7 +1,5 @@
 """Colliders with the shape of a mesh, for simulations."""
 
-from __future__ import annotations
-
 import numpy as np
 import trimesh
 

@@ -1,7 +1,5 @@
 """The surface of a moving body: its mesh at rest, deformed with the particles inside and coloured by its Gaussians."""
 
-from __future__ import annotations
-
 import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
@@ -11,8 +9,7 @@ from neuma_lib.geometry.skinning import carry, skinning_matrix
 from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.splatting.spherical_harmonics import sh0_to_rgb
 
-_NEAREST = 4
-"""Number of Gaussians that colour a vertex."""
+_NEAREST = 4  # number of Gaussians that colour a vertex
 
 
 def moving_surface(mesh: trimesh.Trimesh, x: np.ndarray) -> np.ndarray:

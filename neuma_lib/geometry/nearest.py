@@ -4,7 +4,6 @@ The points of a set are sorted into the cubic cells of a grid. A search begins i
 proceeds outwards over planes and rows of cells as far as a point can be nearer, so the result is exact at any distance.
 """
 
-# No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
 import functools
 from collections.abc import Sequence
 

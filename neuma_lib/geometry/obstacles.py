@@ -1,7 +1,5 @@
 """Surfaces of colliders and their motion, for pictures and other programs."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -12,31 +10,21 @@ from skimage.measure import marching_cubes
 
 from neuma_lib.sim.colliders import Collider
 
-GREY = (0.49, 0.51, 0.54)
-"""Colour of colliders, sRGB."""
-SIGHTS, SAMPLES = 300, 200
-"""Points of a body and points of each line of sight that are tested for obstacles."""
+GREY = (0.49, 0.51, 0.54)  # colour of colliders, sRGB
+SIGHTS, SAMPLES = 300, 200  # points of a body and points of each line of sight that are tested for obstacles
 PLANE_REACH = 0.75
 """Half the side of the square that stands for a plane [m]: the faces of the unit cube with a margin."""
 
 
 @dataclass(frozen=True)
 class Obstacle:
-    """A rigid matte surface in motion.
+    """A rigid matte surface in motion."""
 
-    Attributes:
-        vertices: in its own frame [m], shape (V, 3).
-        faces: shape (M, 3), outward.
-        poses: from its frame to the world at each time, shape (T, 4, 4) [m].
-        color: sRGB in [0, 1].
-        opacity: less than 1 shows what is behind it.
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    poses: np.ndarray
-    color: tuple[float, float, float] = GREY
-    opacity: float = 1.0
+    vertices: np.ndarray  # in its own frame [m], shape (V, 3)
+    faces: np.ndarray  # shape (M, 3), outward
+    poses: np.ndarray  # from its frame to the world at each time, shape (T, 4, 4) [m]
+    color: tuple[float, float, float] = GREY  # sRGB in [0, 1]
+    opacity: float = 1.0  # less than 1 shows what is behind it
 
     @property
     def moves(self) -> bool:

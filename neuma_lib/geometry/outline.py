@@ -1,7 +1,5 @@
 """The outline of a closed triangle mesh in an image, as points of the mesh, and silhouettes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,14 +15,10 @@ _CHUNK = 4_000_000  # pairs of points and triangles at once
 
 @dataclass(frozen=True, eq=False)
 class Outline:
-    """Segments of the outer boundary of a projected mesh.
+    """Segments of the outer boundary of a projected mesh."""
 
-    Attributes:
-        vertices: of the mesh at the two ends of each segment's edge, shape (M, 2).
-        shares: positions of the segment's ends along the edge, from 0 at the first vertex to 1, shape (M, 2).
-    """
-
-    vertices: NDArray[np.int64]
+    vertices: NDArray[np.int64]  # of the mesh at the two ends of each segment's edge, shape (M, 2)
+    # positions of the segment's ends along the edge, from 0 at the first vertex to 1, shape (M, 2)
     shares: Array
 
     def ends(self, values: Array) -> Array:

@@ -1,7 +1,5 @@
 """Repair and isotropic remeshing of surfaces with MeshLab (Cignoni et al. 2008, by pymeshlab)."""
 
-from __future__ import annotations
-
 import importlib.util
 from types import ModuleType
 
@@ -12,17 +10,12 @@ from neuma_lib.errors import InputError
 from neuma_lib.extras import require
 from neuma_lib.geometry.volume import check_mesh
 
-MAX_HOLE_EDGES = 1000
-"""Maximum number of edges of a hole that is closed."""
-_ROUNDS = 4
-"""Attempts to remove self-intersections and close the holes."""
-_REMESHINGS = 6
-"""Iterations of the remeshing."""
-_WRAP = (4.0, 0.05)
-"""Alpha and offset of the alpha wrapping, in edge lengths."""
+MAX_HOLE_EDGES = 1000  # maximum number of edges of a hole that is closed
+_ROUNDS = 4  # attempts to remove self-intersections and close the holes
+_REMESHINGS = 6  # iterations of the remeshing
+_WRAP = (4.0, 0.05)  # alpha and offset of the alpha wrapping, in edge lengths
 
-_MIN_THICKNESS = 0.15
-"""Minimum volume over area of a wrapped body, in edge lengths; a wrapped sheet has 0.05."""
+_MIN_THICKNESS = 0.15  # minimum volume over area of a wrapped body, in edge lengths; a wrapped sheet has 0.05
 
 
 def repaired(mesh: trimesh.Trimesh, edge: float, name: str = "mesh") -> trimesh.Trimesh:
@@ -35,7 +28,6 @@ def repaired(mesh: trimesh.Trimesh, edge: float, name: str = "mesh") -> trimesh.
     Args:
         mesh: triangles [m]; may have holes, several bodies and any orientation.
         edge: target length of an edge [m].
-        name: for messages.
 
     Raises:
         InputError: pymeshlab is missing, there are no finite faces, or no closed body is left.

@@ -8,8 +8,6 @@ Frame: right-handed, y up, front towards +z and the frontal camera. Nominal size
 Thin parts (necks, ears, tails) have about 6 cm, so that a grid of 24 cells per metre resolves them.
 """
 
-from __future__ import annotations
-
 import difflib
 import re
 import string
@@ -404,17 +402,12 @@ def _letter(character: str) -> Shape:
 
 
 _MAKERS = {"ball": _ball, "duck": _duck, "pawn": _pawn, "cat": _cat, "bottle": _bottle, "fish": _fish}
-NAMES = tuple(_MAKERS)
-"""Named solids, in addition to ``letter_A`` ... ``letter_Z``."""
+NAMES = tuple(_MAKERS)  # named solids, in addition to ``letter_A`` ... ``letter_Z``.
 
 
 @cache
 def shape(name: str) -> Shape:
-    """The solid with a name.
-
-    Raises:
-        InputError: unknown name; the message lists the known ones.
-    """
+    """The solid with a name. Raises InputError: unknown name; the message lists the known ones."""
     if name in _MAKERS:
         return _MAKERS[name]()
     if re.fullmatch(r"letter_[A-Z]", name):

@@ -5,8 +5,6 @@ coefficients that reproduce affine motions exactly. The elastic deformation grad
 the plastic part of the motion.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree

@@ -1,7 +1,5 @@
 """The solid body in a mesh of any quality, for example one that another program wrote."""
 
-from __future__ import annotations
-
 import numpy as np
 import trimesh
 
@@ -10,8 +8,7 @@ from neuma_lib.geometry.repair import MAX_HOLE_EDGES, from_meshlab, meshlab, to_
 from neuma_lib.geometry.shapes import Shape, meshed
 from neuma_lib.geometry.volume import signed_distance
 
-_MAX_AREA = 100
-"""Maximum area of a mesh whose longest side is 1. Its distances take a minute; a cube has 6."""
+_MAX_AREA = 100  # maximum area of a mesh whose longest side is 1. Its distances take a minute; a cube has 6.
 _REMESH = (
     "Close its holes and give its walls a thickness, for example with Blender's modifiers Solidify and Remesh"
 )
@@ -28,7 +25,6 @@ def solid_body(
 
     Args:
         mesh: triangles in any unit.
-        name: for messages.
         resolution: cells along the longest side.
 
     Returns:

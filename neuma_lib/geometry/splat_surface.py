@@ -1,7 +1,5 @@
 """A watertight surface of Gaussians, from the opacity and depth of renders from all directions."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 import trimesh

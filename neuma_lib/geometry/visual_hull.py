@@ -4,8 +4,6 @@ Each alpha matte is converted to a signed distance to its contour at half covera
 of the back-projected distances over the views approximates the signed distance of the hull.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -20,36 +18,26 @@ from torch import Tensor
 from neuma_lib.errors import InputError
 from neuma_lib.splatting.cameras import Cameras
 
-MATTE_LEVEL = 0.5
-"""Alpha of the contour of a silhouette."""
-_LACKING_RESOLUTION = 40
-"""Voxels along the longest side of the body in `lacking`."""
-_BAND = 6.0
-"""Distance from a contour [px] up to which it is computed with sub-pixel accuracy."""
+MATTE_LEVEL = 0.5  # alpha of the contour of a silhouette
+_LACKING_RESOLUTION = 40  # voxels along the longest side of the body in `lacking`
+_BAND = 6.0  # distance from a contour [px] up to which it is computed with sub-pixel accuracy
 _MIN_INFORMATIVE = 0.25
 """Minimum fraction of the views, and at least two, that must have information on a point. Without it, regions cropped
 by nearly all frames would form long spikes."""
 _OUTSIDE = 1e-3
 """Minimum distance outside the hull of points behind a camera or with information from too few views [m]."""
-_CONTOUR_STEPS = 8
-"""Points on each segment of a contour, which is at most as long as a pixel's diagonal."""
+_CONTOUR_STEPS = 8  # points on each segment of a contour, which is at most as long as a pixel's diagonal
 _FIELD_OF_VIEW = 0.75
 """Half side of the search cube over the width that the nearest camera sees at the centre of the cube."""
 
 
 @dataclass
 class Hull:
-    """Voxels inside every silhouette.
+    """Voxels inside every silhouette."""
 
-    Attributes:
-        occupied: (X, Y, Z) bool.
-        origin: (3,) corner of the grid [m].
-        voxel: side of a voxel [m].
-    """
-
-    occupied: Tensor
-    origin: Tensor
-    voxel: float
+    occupied: Tensor  # (X, Y, Z) bool
+    origin: Tensor  # (3,) corner of the grid [m]
+    voxel: float  # side of a voxel [m]
 
 
 def check_masks(masks: Tensor | Sequence[Tensor], level: float = MATTE_LEVEL) -> None:

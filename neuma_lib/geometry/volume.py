@@ -3,7 +3,6 @@
 Meshes are `trimesh.Trimesh` in metres, watertight and oriented outwards. Points are float64 arrays.
 """
 
-# No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
 from collections.abc import Sequence
 from itertools import combinations, product
 from typing import Literal
@@ -21,12 +20,9 @@ start_warp()
 
 Array = NDArray[np.float64]
 
-_ATTEMPTS = 12
-"""Maximum number of draws to reach the requested count."""
-_COUNT_TOLERANCE = 0.01
-"""Relative error of the count at which the attempts stop; the guaranteed error is 5 %."""
-_CELLS_PER_POINT = 4
-"""Cells per point of the grid that reduces the number of evaluated winding numbers."""
+_ATTEMPTS = 12  # maximum number of draws to reach the requested count
+_COUNT_TOLERANCE = 0.01  # relative error of the count at which the attempts stop; the guaranteed error is 5 %
+_CELLS_PER_POINT = 4  # cells per point of the grid that reduces the number of evaluated winding numbers
 _MAX_CELLS = 20_000_000
 """Maximum number of cells, or of independent points, in the bounding box of a sampled body: about 2 GB."""
 

@@ -4,8 +4,6 @@ A checkpoint is not a declared output of its stage. It holds a fingerprint of se
 if the fingerprint differs, and is removed when the stage has written its result.
 """
 
-from __future__ import annotations
-
 import io
 from collections.abc import Mapping
 from pathlib import Path

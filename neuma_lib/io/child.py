@@ -3,8 +3,6 @@
 For formats whose readers allocate before they check, or may crash. The child returns arrays and no objects.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -17,8 +15,7 @@ import numpy as np
 from neuma_lib.errors import InputError
 from neuma_lib.io.files import one_line
 
-MAX_MEMORY = 384 * 2**20
-"""Address space that a child may add to that of the loaded libraries [bytes]."""
+MAX_MEMORY = 384 * 2**20  # address space that a child may add to that of the loaded libraries [bytes]
 MAX_SECONDS = 30
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
@@ -28,7 +25,6 @@ def arrays_from_child(reader: str, path: str | Path, kind: str) -> dict[str, np.
 
     Args:
         reader: ``module:function`` of a path.
-        path: of the file.
         kind: content of the file, for messages.
 
     Raises:

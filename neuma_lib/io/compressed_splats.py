@@ -6,8 +6,6 @@ name the largest component, 3 x 10 bits hold the others), colour and opacity (8 
 for each coefficient of the higher harmonics, by channel.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -20,13 +18,11 @@ from neuma_lib.splatting.culling import morton_order
 from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.splatting.spherical_harmonics import SH_C0
 
-CHUNK = 256
-"""Gaussians with common ranges."""
+CHUNK = 256  # Gaussians with common ranges
 _RANGES = [f"{end}_{of}{axis}" for of in ("", "scale_") for end in ("min", "max") for axis in "xyz"]
 _COLOURS = [f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"]
 _WORDS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
-_SH_RANGE = 8.0
-"""Width of the range of a higher coefficient, centred at zero."""
+_SH_RANGE = 8.0  # width of the range of a higher coefficient, centred at zero
 _SQRT2 = np.sqrt(2.0)
 
 

@@ -17,8 +17,6 @@
 Unknown values are null.
 """  # noqa: E501
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from pathlib import Path

@@ -7,8 +7,6 @@ give equal bytes, without dates, host names or paths. Readers check sizes before
 Lengths are metres, times seconds, masses kilograms; arrays are numpy.
 """
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """Gaussians as PLY in the layout of the 3DGS release."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path

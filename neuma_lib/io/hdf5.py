@@ -1,7 +1,5 @@
 """Named quantities with units in HDF5: trajectories, sets of particles and sparse matrices."""
 
-from __future__ import annotations
-
 import json
 import mmap
 import re
@@ -41,10 +39,8 @@ QUANTITIES = {
 
 INTEGERS = ("frames", "indptr", "indices", "body", "tracer_body")
 """Quantities that are indices or counts: integers that are not negative."""
-_HEAP = b"GCOL\1\0\0\0"
-"""Signature and version of a global heap."""
-_MAX_ATTRIBUTE = 2**20
-"""Maximum size of an attribute [bytes]."""
+_HEAP = b"GCOL\1\0\0\0"  # signature and version of a global heap
+_MAX_ATTRIBUTE = 2**20  # maximum size of an attribute [bytes]
 
 
 def write_arrays(

@@ -1,7 +1,5 @@
 """Calibrated images: transforms.json and the images that it lists."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 import os

@@ -6,8 +6,6 @@ structured law, :data:`ANALYTIC` those of an analytic law without tensors. Any o
 file may contain an adaptor and the weights that it corrects, as that of a structured law does. It needs no prior then.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Tracks of markers in CSV files of motion capture."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Sequence
 from pathlib import Path

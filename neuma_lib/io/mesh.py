@@ -1,7 +1,5 @@
 """Triangle meshes as PLY."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Mesh files of other programs: OBJ, PLY, STL and GLB."""
 
-from __future__ import annotations
-
 from io import BytesIO
 from pathlib import Path
 
@@ -13,10 +11,8 @@ from neuma_lib.errors import InputError
 from neuma_lib.io.child import arrays_from_child
 from neuma_lib.io.files import existing
 
-MAX_MESH_BYTES = 32 * 2**20
-"""Maximum size of a mesh file of another program."""
-MAX_FACES = 500_000
-"""Maximum number of its triangles."""
+MAX_MESH_BYTES = 32 * 2**20  # maximum size of a mesh file of another program
+MAX_FACES = 500_000  # maximum number of its triangles
 _SIMPLIFY = "Simplify the mesh, for example with Blender's modifier Decimate"
 
 

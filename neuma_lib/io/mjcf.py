@@ -1,7 +1,5 @@
 """Deformable bodies of MuJoCo as MJCF text: a flex of tetrahedra, and its constants read back."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,8 +11,7 @@ import numpy as np
 from neuma_lib.errors import InputError
 from neuma_lib.io.files import existing, one_line, reading
 
-MAX_BYTES = 1 << 28
-"""Size of a file that is read."""
+MAX_BYTES = 1 << 28  # size of a file that is read
 
 
 def flex_scene(

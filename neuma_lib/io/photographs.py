@@ -23,12 +23,9 @@ from neuma_lib.io.images import (
 )
 from neuma_lib.splatting.cameras import Cameras
 
-MIN_PHOTOGRAPHS = 4
-"""Minimum number of photographs of a body."""
-MAX_LEFT_OUT = 0.3
-"""Maximum fraction of rejected photographs."""
-_MIN_MARGIN = 8
-"""Minimum margin around a mask [px], larger than the radius of the window of SSIM."""
+MIN_PHOTOGRAPHS = 4  # minimum number of photographs of a body
+MAX_LEFT_OUT = 0.3  # maximum fraction of rejected photographs
+_MIN_MARGIN = 8  # minimum margin around a mask [px], larger than the radius of the window of SSIM
 
 
 @dataclass(frozen=True, eq=False)

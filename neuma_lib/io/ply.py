@@ -1,7 +1,5 @@
 """PLY files: vertices with any scalar properties, and triangles. `mesh` and `gaussians` interpret them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from io import BytesIO
 from pathlib import Path
@@ -11,10 +9,8 @@ from plyfile import PlyData, PlyElement, PlyListProperty
 
 from neuma_lib.io.files import atomic, existing, reading
 
-MAX_HEADER = 2**16
-"""Maximum length of a header [bytes]; that of 3D Gaussian splatting has 1.5 kB."""
-TRIANGLES = ("vertex_indices", "vertex_index")
-"""Common names of the list of a face's corners."""
+MAX_HEADER = 2**16  # maximum length of a header [bytes]; that of 3D Gaussian splatting has 1.5 kB
+TRIANGLES = ("vertex_indices", "vertex_index")  # common names of the list of a face's corners
 
 
 def write_ply(path: str | Path, vertices: np.ndarray, faces: np.ndarray | None = None) -> None:

@@ -1,7 +1,5 @@
 """Predicted positions of points in files of other programs: HDF5, npz, or a PLY for each frame."""
 
-from __future__ import annotations
-
 import io
 import re
 import zipfile
@@ -15,12 +13,9 @@ from neuma_lib.io.files import existing, reading, zip_member
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.ply import read_ply, write_ply
 
-NAMES = ("tracers", "x")
-"""Names of the array of positions, the preferred one first."""
-MAX_BYTES = 2**31
-"""Maximum size of an array [bytes]."""
-MAX_DISTANCE = 100.0
-"""Maximum coordinate of a point [m]. Larger ones are in other units."""
+NAMES = ("tracers", "x")  # names of the array of positions, the preferred one first
+MAX_BYTES = 2**31  # maximum size of an array [bytes]
+MAX_DISTANCE = 100.0  # maximum coordinate of a point [m]. Larger ones are in other units.
 _REMEDY = "Write an array x (T, N, 3) of positions in metres"
 
 

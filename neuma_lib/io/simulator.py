@@ -1,7 +1,5 @@
 """The simulator from its settings, whose colliders, clamps and pairs are plain and may name the files of meshes."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

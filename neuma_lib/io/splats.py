@@ -8,8 +8,6 @@
 Coordinates are those of the file. No format defines the up direction.
 """
 
-from __future__ import annotations
-
 import struct
 import zlib
 from dataclasses import fields
@@ -25,22 +23,17 @@ from neuma_lib.io.ply import read_elements
 from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.splatting.spherical_harmonics import MAX_DEGREE, SH_C0, coefficient_count
 
-KINDS = (".ply", ".splat", ".spz")
-"""Supported file suffixes."""
+KINDS = (".ply", ".splat", ".spz")  # supported file suffixes
 _REMEDY = "Remove it in a splat editor, or export the file again"
 _SPLAT = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 _SPZ_HEADER = struct.Struct("<IIIBBBB")
 """Magic number, version, count, degree of harmonics, fractional bits of positions, flags, reserved."""
 _SPZ_MAGIC = 0x5053474E
 _SPZ_VERSIONS = (1, 2, 3)
-_SPZ_EXTENSIONS = 2
-"""Flag of extensions, which include other ranges of the harmonics."""
-_SPZ_COLOUR = 0.15
-"""Stored colour per unit of sh0."""
-_MAX_INFLATION = 16
-"""Maximum compression ratio; that of scans is 1 to 5, and that of gzip itself up to 1032."""
-_ALWAYS_READ = 2**23
-"""Unpacked size that is read at any ratio [bytes]."""
+_SPZ_EXTENSIONS = 2  # flag of extensions, which include other ranges of the harmonics
+_SPZ_COLOUR = 0.15  # stored colour per unit of sh0
+_MAX_INFLATION = 16  # maximum compression ratio; that of scans is 1 to 5, and that of gzip itself up to 1032
+_ALWAYS_READ = 2**23  # unpacked size that is read at any ratio [bytes]
 
 
 def load_splat(path: str | Path) -> Gaussians:

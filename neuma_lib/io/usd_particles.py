@@ -4,8 +4,6 @@ The material is a ``NewtonMPMMaterialAPI``, the solver a ``NewtonMPMSceneAPI`` (
 do not know these schemas show coloured points.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Tensors on disk: safetensors with metadata, and files of torch.save, which are read without executing code."""
 
-from __future__ import annotations
-
 import io
 import json
 import math

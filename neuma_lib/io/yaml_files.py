@@ -1,7 +1,5 @@
 """YAML of settings and captures. What a file expands to is bounded before anything is built of it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Low-rank adaptor (the paper's Delta M, Sec. 3.2): the trained correction of a frozen prior law."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import torch

@@ -1,7 +1,5 @@
 """Analytic laws from a specification, as used in the settings of scenes and priors."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

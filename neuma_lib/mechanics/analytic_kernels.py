@@ -54,14 +54,11 @@ LAWS = (
 )
 """Names of the classes of laws with kernels, in the order of their indices."""
 WITHOUT_SINGULAR_VALUES = {"StVK", "NeoHookean", "Fluid", "Identity"}
-COEFFICIENTS = 7
-"""Largest number of coefficients of a law."""
-KEPT = 21
-"""Numbers per row in a cache: U, V and the singular values."""
+COEFFICIENTS = 7  # largest number of coefficients of a law
+KEPT = 21  # numbers per row in a cache: U, V and the singular values
 CPU_WIDTH = {torch.float32: 32, torch.float64: 16}
 """Rows in a pack on a CPU: 1024 bits, so that two or more registers hide the latency of roots and quotients."""
-THREADS = 64
-"""Threads per block on a GPU."""
+THREADS = 64  # threads per block on a GPU
 _own = addressed(copies=int, n=int)
 
 

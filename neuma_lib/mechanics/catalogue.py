@@ -6,8 +6,6 @@ A specification has the parts ``elasticity`` and optionally ``plasticity``, ``vi
 "yield_stress": 5e3}}``
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

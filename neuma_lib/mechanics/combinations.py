@@ -1,9 +1,6 @@
 """Combinations of material constants that can be identifiable from motion when single constants are not."""
 
-from __future__ import annotations
-
-Values = dict[str, float]
-"""Constants by name, in SI units and degrees."""
+Values = dict[str, float]  # constants by name, in SI units and degrees
 
 
 def physical(values: Values) -> Values:

@@ -1,7 +1,5 @@
 """Mass density of a body at rest: constant, or two values separated by a plane."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import torch

@@ -7,8 +7,6 @@ Lamé parameters mu, lam and J = sigma_1 sigma_2 sigma_3. All are symmetric, obj
 they agree with `Hencky` at small strains (`FibreReinforced` in its matrix) and deviate at the strains of an impact.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -1,7 +1,5 @@
 """Launches of fused kernels, which take arrays as addresses: Warp's array objects take more time than the kernels."""
 
-from __future__ import annotations
-
 import threading
 from collections import defaultdict
 from collections.abc import Iterator, Sequence

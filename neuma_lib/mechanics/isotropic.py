@@ -7,8 +7,6 @@ because the quotient is an even function of the distance). Laws with closed-form
 :func:`coaxial_stress` and :func:`coaxial_deformation`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

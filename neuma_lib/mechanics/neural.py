@@ -12,8 +12,6 @@ Zero features give zero output because there is no bias, so rotations are stress
 other GPUs, and in float64 on any, autograd differentiates `NeuralConstitutive.response`, the reference of the kernels.
 """
 
-from __future__ import annotations
-
 from collections.abc import Hashable
 from types import ModuleType
 

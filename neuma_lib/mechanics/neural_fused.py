@@ -19,8 +19,6 @@ and compute one slice of the result each. Blocks write separate partial sums, an
 order, after each call or after many calls that accumulate in :func:`partial_sums`.
 """
 
-from __future__ import annotations
-
 from functools import cache
 
 import torch
@@ -40,15 +38,13 @@ from neuma_lib.mechanics.law import Weights
 from neuma_lib.mechanics.neural_vector import FEATURES, GRAM
 from neuma_lib.mechanics.singular_values_kernels import SVD, SWEEPS
 
-ROWS = 128
-"""Rows per block."""
+ROWS = 128  # rows per block
 EVALUATE_TILES, VJP_TILES = 2, 1
 """Tiles of 16 rows per warp, forward and backward. One tile gives twice as many warps with half the registers, which
 hides more latency for few rows, but two lanes then compute the features and stress of each row redundantly."""
 HIDDEN, OUTPUTS = 64, 9
 WEIGHTS = HIDDEN * (FEATURES + HIDDEN + OUTPUTS)
-ALIGNMENT = 128
-"""Largest number of bytes of shared memory lost to alignment."""
+ALIGNMENT = 128  # largest number of bytes of shared memory lost to alignment
 
 # Byte offsets in shared memory. A matrix of halves consists of its high parts followed by its low parts. The order of
 # the chunks of eight halves in a row (128 bytes for 64 columns, 32 bytes for 16) depends on the row, so that ldmatrix,

@@ -21,17 +21,14 @@ from neuma_lib.mechanics.law import Weights
 from neuma_lib.mechanics.singular_values_kernels import END, FUSE, SVD, TYPES, filled, warp_types
 
 FEATURES = 13
-GRAM = native_source(__file__, ".h")["gram"]
-"""C++ source of F^T F and det F."""
-BLOCK = 64
-"""Rows per block."""
+GRAM = native_source(__file__, ".h")["gram"]  # C++ source of F^T F and det F
+BLOCK = 64  # rows per block
 HIDDEN = 64
 INPUTS, OUTPUTS = 10, 6
 """Columns of the first and rows of the last layer, with one for each pair of equal features or outputs."""
 KEPT = 27
 """Numbers per row in a cache: U, V, the singular values and X. Activations are recomputed, which is faster."""
-NARROW = 16
-"""Columns of a matrix of inputs or outputs: those of a vector, the last ones unused."""
+NARROW = 16  # columns of a matrix of inputs or outputs: those of a vector, the last ones unused
 RANGE = {torch.float32: 5.75, torch.float64: 8.3}
 """|x| from which the standard normal distribution is constant to round-off."""
 TERMS = {torch.float32: (16, 6), torch.float64: (36, 12)}

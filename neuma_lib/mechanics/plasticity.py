@@ -8,8 +8,6 @@ Their formulas use the stresses of `Hencky` elasticity with the same E and nu: t
 the logarithmic strain eps and K = lam + 2 mu / 3, p = -tr(tau) / 3, q = sqrt(3/2) |dev tau|.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -3,8 +3,6 @@
 The particles of the copies follow each other in memory. All are evaluated in one launch (`analytic_kernels`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Hashable, Sequence
 
 import torch

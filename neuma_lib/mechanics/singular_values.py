@@ -8,8 +8,6 @@ Warp's ``svd3`` is not used because it takes three times as long on a CPU for 2,
 error of 26 % at F = I (``benchmarks/singular_values.py``, results in ``docs/results/speed.md``).
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

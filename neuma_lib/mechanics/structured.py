@@ -44,8 +44,6 @@ A last layer of zeros, the start of training and an adaptor weight of 0, reprodu
 bases are ``identity`` (elastic, no network), ``von_mises``, ``drucker_prager`` and ``viscous_flow``.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Hashable, Mapping
 from typing import Any

@@ -33,25 +33,19 @@ from neuma_lib.mechanics.singular_values_kernels import (
 
 WIDTH = 16
 INVARIANTS = 3
-LIMIT = 3.0
-"""Bound of the outputs of the network, which scale a constant by at most exp(3) = 20."""
+LIMIT = 3.0  # bound of the outputs of the network, which scale a constant by at most exp(3) = 20
 GROWTH = 2.0
 """Growth rate of constants that are zero in the base. After a first optimiser step the output is about 0.05: a share of
 the trace then relaxes within some 4000 steps, and a cohesion or yield strain becomes 2e-5."""
-STRAIN = 0.1
-"""Unit of strain for the network."""
-SMOOTH = 0.05
-"""Strain below which the norm of the deviator, not differentiable at zero, is smoothed."""
-LODE = 3 * math.sqrt(6)
-"""|det dev e| is at most |dev e|^3 / LODE."""
-COHESION_UNIT = 0.02
-"""Cohesion or yield strain at g = 1 if it is zero in the base; g is at most LIMIT."""
+STRAIN = 0.1  # unit of strain for the network
+SMOOTH = 0.05  # strain below which the norm of the deviator, not differentiable at zero, is smoothed
+LODE = 3 * math.sqrt(6)  # |det dev e| is at most |dev e|^3 / LODE
+COHESION_UNIT = 0.02  # cohesion or yield strain at g = 1 if it is zero in the base; g is at most LIMIT
 KINDS = {"stretch": 3, "energy": 2, "return": 5}
 """Number of network outputs by kind of kernel: the two forms of elasticity, and plasticity."""
 BASES = ("hencky", "neo_hookean", "fixed_corotated")
 """Bases of elasticity in the order of their indices in the kernels."""
-CACHED = 24
-"""Numbers per row that a CPU caches: U, V, the singular values, and those after a return map."""
+CACHED = 24  # numbers per row that a CPU caches: U, V, the singular values, and those after a return map
 EVALUATE_WIDTH = {torch.float32: 32, torch.float64: 16}
 """Rows in a pack of the forward kernel on a CPU: two registers hide the latency of roots and quotients. The sums of the
 backward kernel would not fit into the first cache."""

@@ -1,7 +1,5 @@
 """Dependence of a law on the time step of the simulation."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 from neuma_lib.mechanics.adaptor import AdaptableConstitutive

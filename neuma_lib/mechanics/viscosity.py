@@ -85,5 +85,4 @@ class Maxwell(Viscosity, name="maxwell"):
     """
 
 
-VISCOSITIES = Viscosity.named
-"""Viscous parts by name."""
+VISCOSITIES = Viscosity.named  # viscous parts by name

@@ -1,7 +1,5 @@
 """The analytic law whose family and constants the stage `identify` fits to the video."""
 
-from __future__ import annotations
-
 from neuma_lib.methods.base import AS_IDENTIFIED, Case, Files, Method, Preset, friction_options
 
 

@@ -1,7 +1,5 @@
 """Laws drawn from the uncertainty of constants that `identify` fitted, and of corrections of their law."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Models of motion, which `Method.load` returns and which predict the states of bodies."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

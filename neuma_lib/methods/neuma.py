@@ -1,7 +1,5 @@
 """NeuMA (paper Sec. 3): the networks of a prior and a low-rank correction, trained on pixels."""
 
-from __future__ import annotations
-
 from neuma_lib.config.motion import WithPrior
 from neuma_lib.config.training import TrainingConfig
 from neuma_lib.methods.base import AS_IDENTIFIED, Case, Files, Method, Preset, training_inputs

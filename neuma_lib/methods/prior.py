@@ -1,7 +1,5 @@
 """The prior without adaptation (NCLaw): nothing is learned from the video."""
 
-from __future__ import annotations
-
 from neuma_lib.config.motion import MotionOptions, WithPrior
 from neuma_lib.methods.base import Case, Files, Method, ModelSource, Preset
 

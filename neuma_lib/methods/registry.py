@@ -1,7 +1,5 @@
 """All methods: the built-in ones, those of installed packages (entry points ``neuma.methods``) and of extensions."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import cache
 from importlib.metadata import entry_points

@@ -1,7 +1,5 @@
 """An analytic law and a correction by small networks that keep the structure of a material."""
 
-from __future__ import annotations
-
 from neuma_lib.config.motion import WithPrior
 from neuma_lib.config.structured import StructuredConfig
 from neuma_lib.config.training import TrainingConfig

@@ -1,7 +1,5 @@
 """Training of `neuma` and `structured`: bodies, initial states and losses of all videos, and the report."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any

@@ -1,7 +1,5 @@
 """The true law of the scene on the reconstructed body. Its error is that of reconstruction and initial motion."""
 
-from __future__ import annotations
-
 from neuma_lib.methods.base import Case, Files, Method, Preset
 
 

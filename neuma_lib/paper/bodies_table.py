@@ -1,7 +1,5 @@
 """Table of the bodies of a scene: errors and constants, identified together and each alone, and frictions."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any

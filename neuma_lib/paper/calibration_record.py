@@ -3,8 +3,6 @@
 The record does not depend on the calibration, so that another calibration repeats no simulation.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

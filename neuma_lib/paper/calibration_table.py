@@ -1,7 +1,5 @@
 """Coverage and scores of intervals of constants and predicted motions, and of probabilities of families."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
@@ -26,8 +24,7 @@ from neuma_lib.paper.claims import FAILS, HOLDS, MIXED, Verdict, verdict_lines
 
 TARGETS = {0.5: (0.45, 0.55), 0.8: (0.75, 0.85), 0.95: (0.92, 0.98)}
 """Level of intervals -> range of the share of truths that they should contain."""
-BAND = 0.1
-"""Half width of the fixed band: of a constant, or of the distance of a point from its start."""
+BAND = 0.1  # half width of the fixed band: of a constant, or of the distance of a point from its start
 CALIBRATED, LAPLACE, FIXED = "calibrated", "Laplace", f"fixed {100 * BAND:.0f} %"
 METHODS = (CALIBRATED, LAPLACE, FIXED)
 CONSTANTS, LAUNCH, SHAPE, FAMILY = "constants", "another launch", "another shape", "family"

@@ -4,8 +4,6 @@ A claim is a statement and a rule that checks it with a `Frame`, the errors of a
 measures all motion and has no sampling floor. The paper gives Chamfer distances only.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,14 +12,10 @@ import numpy as np
 
 from neuma_lib.evaluation.text_tables import as_markdown
 
-RMSE = "tracer_rmse_mm"
-"""Quantity that claims are checked with, unless they name another."""
-PRINTED = "chamfer_paper"
-"""Chamfer distances in the paper. NaN for columns that the paper does not have."""
-BROKEN = "broke_off"
-"""Runs whose prediction stopped early [%]."""
-MIN_REPLICATES = 3
-"""Number of replicates that a standard deviation needs to support a claim."""
+RMSE = "tracer_rmse_mm"  # quantity that claims are checked with, unless they name another
+PRINTED = "chamfer_paper"  # Chamfer distances in the paper. NaN for columns that the paper does not have.
+BROKEN = "broke_off"  # runs whose prediction stopped early [%]
+MIN_REPLICATES = 3  # number of replicates that a standard deviation needs to support a claim
 
 HOLDS, MIXED, FAILS = "holds", "mixed", "does not hold"
 UNPUBLISHED = "not compared there"
@@ -101,19 +95,14 @@ def spread_note(replicates: int) -> str:
 
 @dataclass
 class Frame:
-    """Values by quantity, method, column and replicate.
+    """Values by quantity, method, column and replicate."""
 
-    Attributes:
-        columns: name of each scene or experiment -> heading.
-        rows: (quantity, method) -> values, in the order of the tables.
-        broken: (method, column) of predictions that stopped early.
-        diverged: (method, column) of trainings that diverged.
-    """
-
-    columns: dict[str, str]
+    columns: dict[str, str]  # name of each scene or experiment -> heading
+    # (quantity, method) -> values, in the order of the tables
     rows: dict[tuple[str, str], Row] = field(default_factory=dict)
+    # (method, column) of predictions that stopped early
     broken: set[tuple[str, str]] = field(default_factory=set)
-    diverged: set[tuple[str, str]] = field(default_factory=set)
+    diverged: set[tuple[str, str]] = field(default_factory=set)  # (method, column) of trainings that diverged
 
     def add(self, quantity: str, method: str, title: str, runs: Sequence[Sequence[float]]) -> None:
         """Add the values of a quantity and method, (replicates, columns)."""
@@ -134,19 +123,12 @@ class Frame:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Result of checking a claim.
+    """Result of checking a claim."""
 
-    Attributes:
-        text: the claim.
-        word: "holds", "mixed" or "does not hold".
-        here: our numbers, and what keeps the claim from holding.
-        paper: the paper's Chamfer distances, or why there are none.
-    """
-
-    text: str
-    word: str
-    here: str
-    paper: str = UNPUBLISHED
+    text: str  # the claim
+    word: str  # "holds", "mixed" or "does not hold"
+    here: str  # our numbers, and what keeps the claim from holding
+    paper: str = UNPUBLISHED  # the paper's Chamfer distances, or why there are none
 
     def __str__(self) -> str:
         return f"{self.word.capitalize()}: {self.text}. {self.here}."
@@ -159,19 +141,14 @@ class Closer:
     For three replicates of equal spread, no overlap of the intervals means t > 2.4, which occurs by chance in 4 of 100
     cases. Predictions that stop early do not count because their error is too small. "No worse" is checked like
     "closer", since a difference that is not seen may still exist.
-
-    Attributes:
-        text: the claim.
-        better, worse: methods. The worst of the first is compared with the best of the second.
-        columns: scenes or experiments; all columns if empty.
-        by_paper: whether the paper makes the comparison.
     """
 
-    text: str
+    text: str  # the claim
+    # better, worse: methods. The worst of the first is compared with the best of the second.
     better: tuple[str, ...]
     worse: tuple[str, ...]
-    columns: tuple[str, ...] = ()
-    by_paper: bool = True
+    columns: tuple[str, ...] = ()  # scenes or experiments; all columns if empty
+    by_paper: bool = True  # whether the paper makes the comparison
 
     @property
     def methods(self) -> set[str]:
@@ -233,26 +210,17 @@ class Bound:
 
     The claim *holds* if means plus standard deviations over at least `MIN_REPLICATES` replicates are within the bound,
     and no prediction of the method stopped early. It is *mixed* if the means alone are, else it *does not hold*.
-
-    Attributes:
-        text: the claim.
-        method: whose error is bounded.
-        limit: the bound in the unit of the quantity, or in multiples of the error of the method ``of``.
-        of: the method to compare with in the same column; none if empty.
-        count: number of columns that must be within the bound. None: the average over the columns must be.
-        columns: scenes or experiments; all columns if empty.
-        quantity: quantity that is bounded.
-        also: name and quantity [%] of the method that the verdict states, too.
     """
 
-    text: str
-    method: str
-    limit: float
-    of: str = ""
+    text: str  # the claim
+    method: str  # whose error is bounded
+    limit: float  # the bound in the unit of the quantity, or in multiples of the error of the method ``of``
+    of: str = ""  # the method to compare with in the same column; none if empty
+    # number of columns that must be within the bound. None: the average over the columns must be.
     count: int | None = None
-    columns: tuple[str, ...] = ()
-    quantity: str = RMSE
-    also: tuple[str, str] | None = None
+    columns: tuple[str, ...] = ()  # scenes or experiments; all columns if empty
+    quantity: str = RMSE  # quantity that is bounded
+    also: tuple[str, str] | None = None  # name and quantity [%] of the method that the verdict states, too
 
     @property
     def methods(self) -> set[str]:
@@ -295,8 +263,6 @@ def counted(
         text: the claim, followed by the number of trials that it needs.
         met: whether each trial meets it.
         share: of the trials that must meet it.
-        what: name of the trials.
-        numbers: added to the verdict.
         whole: text instead of "at least n" if all trials are needed.
     """
     needed, count, total = math.ceil(share * len(met)), sum(met), len(met)

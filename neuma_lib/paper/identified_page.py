@@ -1,7 +1,5 @@
 """A page on the material identified in a video: losses of all families, and constants of the best one."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Identified materials and the true ones: family, errors of the constants, and coverage of their uncertainty."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
@@ -12,10 +10,8 @@ from neuma_lib.evaluation.text_tables import as_csv, as_markdown
 from neuma_lib.mechanics.combinations import named_combinations
 from neuma_lib.paper.claims import Verdict, counted, verdict_lines
 
-WITHIN = 2.0
-"""Maximum error in estimated standard deviations."""
-CLOSE = 10.0
-"""Maximum error of a constant that counts as right [%]."""
+WITHIN = 2.0  # maximum error in estimated standard deviations
+CLOSE = 10.0  # maximum error of a constant that counts as right [%]
 SHARE = Fraction(4, 5)
 """Claimed share of right families, of errors within `WITHIN` and of errors within `CLOSE`."""
 RIGHT, TIE, WRONG = "right", "tie", "wrong"
@@ -54,11 +50,7 @@ def compare_family(identified: Mapping[str, Any], truth: Mapping[str, Mapping[st
 
 
 def right_families(identified: Mapping[str, Any], truth: Mapping[str, Mapping[str, Any]]) -> set[str]:
-    """Names of the candidates of the family of the true law.
-
-    Args:
-        identified, truth: as of `compare_family`.
-    """
+    """Names of the candidates of the family of the true law. ``identified, truth``: as of `compare_family`."""
     return {name for name, fit in identified["families"].items() if _kind(fit["law"]) == _kind(truth)}
 
 

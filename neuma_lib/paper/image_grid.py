@@ -1,7 +1,5 @@
 """Pictures in rows and columns: data file of a figure, and placement on its page."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -18,28 +16,19 @@ from neuma_lib.evaluation.plotting import style
 from neuma_lib.io.files import parse_json
 from neuma_lib.io.hdf5 import read_arrays, write_arrays
 
-GAP = 0.02
-"""Gap between pictures [in]."""
-TITLE = 6.5
-"""Font size of the titles of rows and columns [pt]."""
-_TITLE_DISTANCE = 0.04
-"""Distance of a row's title from its pictures, relative to the width of one."""
+GAP = 0.02  # gap between pictures [in]
+TITLE = 6.5  # font size of the titles of rows and columns [pt]
+_TITLE_DISTANCE = 0.04  # distance of a row's title from its pictures, relative to the width of one
 
 
 @dataclass(frozen=True)
 class ImageGrid:
-    """Pictures of one size in rows and columns, with further numbers of the figure.
+    """Pictures of one size in rows and columns, with further numbers of the figure."""
 
-    Attributes:
-        images: colours 0 to 255, uint8, shape (R, C, H, W, 3).
-        rows: R titles.
-        columns: C titles.
-        numbers: other plain numbers, lists and texts of the figure by name.
-    """
-
-    images: np.ndarray
-    rows: tuple[str, ...]
-    columns: tuple[str, ...]
+    images: np.ndarray  # colours 0 to 255, uint8, shape (R, C, H, W, 3)
+    rows: tuple[str, ...]  # R titles
+    columns: tuple[str, ...]  # C titles
+    # other plain numbers, lists and texts of the figure by name
     numbers: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self):

@@ -1,7 +1,5 @@
 """The benchmark of random scenes of several bodies: a row for each body and each pair, and claims on all."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
@@ -14,8 +12,7 @@ from neuma_lib.evaluation.text_tables import as_csv, as_markdown
 from neuma_lib.paper.claims import RMSE, counted, verdict_lines
 from neuma_lib.paper.identified_table import WRONG, compare_family, compare_quantities
 
-CLOSE = 15.0
-"""Maximum error of a determined constant that counts as right [%]."""
+CLOSE = 15.0  # maximum error of a determined constant that counts as right [%]
 SLIDES = 0.1
 """Maximum error of a friction that counts as right. It is compared if half the distance to the upper end of its band of
 two standard deviations is smaller, since a contact that does not slide does not show it."""
@@ -43,7 +40,6 @@ def piles_table(scenes: Sequence[Mapping[str, Any]], seed: int, is_development: 
             metrics.json with the true laws and the identified ones, ``alone`` and ``alone_metrics``, those of
             identified.json and metrics.json of each body, and ``rest``, those of metrics.json of both laws without the
             first body.
-        seed: of the scenes.
         is_development: whether methods are developed on these scenes. There are no verdicts then.
 
     Raises:

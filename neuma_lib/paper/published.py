@@ -1,7 +1,5 @@
 """Numbers that the paper prints, and the claims that a run is checked with (`published.yaml`)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,23 +16,15 @@ BAND = "band_half_width"
 
 @dataclass(frozen=True)
 class PaperTable:
-    """A table of the paper, or one of ours.
+    """A table of the paper, or one of ours."""
 
-    Attributes:
-        label: its name in the paper.
-        heading: our heading.
-        caption: one sentence for the report.
-        columns: scenes or experiments.
-        rows: method -> one Chamfer distance a column [1e-4 m^2].
-        claims: what is checked with the numbers of a run.
-    """
-
-    label: str = ""
-    heading: str = ""
-    caption: str = ""
-    columns: Sequence[str] = ()
+    label: str = ""  # its name in the paper
+    heading: str = ""  # our heading
+    caption: str = ""  # one sentence for the report
+    columns: Sequence[str] = ()  # scenes or experiments
+    # method -> one Chamfer distance a column [1e-4 m^2]
     rows: Mapping[str, Sequence[float]] = field(default_factory=dict)
-    claims: Sequence[Claim] = ()
+    claims: Sequence[Claim] = ()  # what is checked with the numbers of a run
 
 
 def _claim(entry: Mapping[str, Any]) -> Claim:

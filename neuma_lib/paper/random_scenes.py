@@ -1,7 +1,5 @@
 """The benchmark of random scenes: a row for each scene, and statistics over all."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from statistics import geometric_mean
@@ -41,7 +39,6 @@ def random_table(
         scenes: each with ``name``, ``family``, ``prior``, ``metrics`` {method: content of metrics.json} and ``start``,
             the content of initial_state.json.
         titles: method -> name. The first is the prior, the second the method that claims are about.
-        seed: of the scenes.
         is_development: whether methods are developed on these scenes. There are no verdicts then.
 
     Raises:

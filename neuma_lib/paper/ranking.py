@@ -1,7 +1,5 @@
 """The place of a result among the methods of a recorded table."""
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Mapping

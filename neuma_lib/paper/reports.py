@@ -1,7 +1,5 @@
 """The table of the benchmarks (Table 4) as CSV and Markdown."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

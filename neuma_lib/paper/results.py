@@ -1,7 +1,5 @@
 """Read results of methods on scenes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 

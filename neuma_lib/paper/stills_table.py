@@ -1,7 +1,5 @@
 """Table of stiffness over density of bodies at rest, one row for each clamp."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 
@@ -25,11 +23,7 @@ _NOTE = (
 
 
 def stills_table(results: Mapping[str, Mapping[str, Any]]) -> tuple[str, str]:
-    """CSV and Markdown.
-
-    Args:
-        results: title of a body -> result of `fit_record` or `predict_record`.
-    """
+    """CSV and Markdown. ``results``: title of a body -> result of `fit_record` or `predict_record`."""
     rows = []
     for title, result in results.items():
         predicted = " (predicted)" if result.get("predicted_from") else ""

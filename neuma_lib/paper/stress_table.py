@@ -1,7 +1,5 @@
 """The table of stress errors: a section for each part of the stress, methods in rows, scenes in columns."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

@@ -4,8 +4,6 @@ Claims are checked with the tracer RMSE. The Chamfer distance, the paper's measu
 (`neuma_lib.evaluation.motion` explains its limits).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -41,8 +39,7 @@ QUANTITIES = {
 """Quantities of metrics.json in the order of the CSV, and their headings."""
 FLOOR = "chamfer_floor"
 TRUE_LAW = "true_law"
-REFERENCES = (TRUE_LAW,)
-"""Methods that know the truth and do not compete for the lowest error."""
+REFERENCES = (TRUE_LAW,)  # methods that know the truth and do not compete for the lowest error
 
 TRAINING_DIVERGED, ROLLOUT_DIVERGED = "†", "‡"
 FOOTNOTES = {
@@ -52,27 +49,19 @@ FOOTNOTES = {
 }
 """Signs after numbers, and their meaning."""
 
-ABSORBED = "The true law, simulated as the reconstruction is"
-"""Start of the paragraph of `Table.absorbed`."""
+ABSORBED = "The true law, simulated as the reconstruction is"  # start of the paragraph of `Table.absorbed`
 
 
 @dataclass
 class Table(Frame):
-    """Errors of methods with footnotes. The last column of its texts is the average.
+    """Errors of methods with footnotes. The last column of its texts is the average."""
 
-    Attributes:
-        paper: the table of the paper to compare with, if any.
-        marks: (method, column) -> signs of `FOOTNOTES`, for runs that diverged.
-        failures: a sentence for each prediction that stopped early.
-        notes: method -> footnote.
-        note: text below the heading.
-    """
-
-    paper: PaperTable | None = None
+    paper: PaperTable | None = None  # the table of the paper to compare with, if any
+    # (method, column) -> signs of `FOOTNOTES`, for runs that diverged
     marks: dict[tuple[str, str], str] = field(default_factory=dict)
-    failures: list[str] = field(default_factory=list)
-    notes: Mapping[str, str] = field(default_factory=dict)
-    note: str | None = None
+    failures: list[str] = field(default_factory=list)  # a sentence for each prediction that stopped early
+    notes: Mapping[str, str] = field(default_factory=dict)  # method -> footnote
+    note: str | None = None  # text below the heading
 
     def wins(self) -> dict[str, int]:
         """Number of columns in which each method, except `REFERENCES`, has the lowest mean RMSE."""
@@ -226,7 +215,6 @@ def chamfer_table(
         columns: scene or experiment -> heading, in order.
         paper: the table of the paper to compare with.
         notes: method -> footnote.
-        note: text below the heading.
 
     Raises:
         InputError: there are no methods or columns, a method lacks a column, or a value is not finite.

@@ -1,7 +1,5 @@
 """The folder of a capture: settings, photographs, stills and videos."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -14,33 +12,23 @@ from neuma_lib.errors import InputError
 from neuma_lib.io.files import one_line
 from neuma_lib.io.yaml_files import load_yaml
 
-PHOTOGRAPHS = "photographs"
-"""Group of the photographs. Other groups are named after cameras."""
+PHOTOGRAPHS = "photographs"  # group of the photographs. Other groups are named after cameras.
 PICTURES = (".jpg", ".jpeg", ".png", ".webp")
 VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm")
-HEIF = (".heic", ".heif")
-"""Photographs that the package pillow-heif decodes."""
+HEIF = (".heic", ".heif")  # photographs that the package pillow-heif decodes
 OTHER_PICTURES = (".dng", ".cr2", ".nef", ".arw")
 """Formats of cameras that are not supported. They cause an error, so that no photograph is silently ignored."""
 
 
 @dataclass(frozen=True)
 class Capture:
-    """Files of a capture.
+    """Files of a capture."""
 
-    Attributes:
-        folder: root of the capture.
-        settings: its capture.yaml.
-        photographs: pictures of the object, sorted by name, possibly none yet.
-        stills: camera -> its picture of the empty scene.
-        takes: take -> camera -> video, cameras sorted by name, possibly none yet.
-    """
-
-    folder: Path
-    settings: CaptureConfig
-    photographs: tuple[Path, ...]
-    stills: dict[str, Path]
-    takes: dict[str, dict[str, Path]]
+    folder: Path  # root of the capture
+    settings: CaptureConfig  # its capture.yaml
+    photographs: tuple[Path, ...]  # pictures of the object, sorted by name, possibly none yet
+    stills: dict[str, Path]  # camera -> its picture of the empty scene
+    takes: dict[str, dict[str, Path]]  # take -> camera -> video, cameras sorted by name, possibly none yet
 
     def pictures(self) -> dict[str, tuple[Path, ...]]:
         """Photographs and stills, by group. Raises InputError if photographs, or the still of a camera, are missing."""

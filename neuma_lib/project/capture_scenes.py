@@ -1,7 +1,5 @@
 """Scenes of captures: the object at rest from its photographs, and each take."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Mapping
 from functools import partial

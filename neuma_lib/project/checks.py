@@ -3,8 +3,6 @@
 `neuma check` and every call of Snakemake make the same checks, before the first job.
 """
 
-from __future__ import annotations
-
 import ctypes
 import importlib.metadata
 import math
@@ -34,8 +32,7 @@ from neuma_lib.project.random_scenes import LETTER, SHAPES, Proportions, flight,
 from neuma_lib.project.settings import Config
 
 ROUND_OFF = 1e-6
-CONTACT_CELLS = 2.5
-"""At least the width of the zone at a wall in which a body touches it [cells]."""
+CONTACT_CELLS = 2.5  # at least the width of the zone at a wall in which a body touches it [cells]
 
 
 def problems(settings: Config) -> list[str]:

@@ -1,7 +1,5 @@
 """Checks of settings across sections: names that exist, options that fit their method, independent seeds."""
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Iterator
@@ -19,22 +17,16 @@ from neuma_lib.project.cases import check_prior, law_from, section_values
 from neuma_lib.project.paths import IDENTIFIED
 from neuma_lib.project.settings import Config
 
-SOURCES = ("config", "docs", "neuma_lib", "profiles", "workflow")
-"""Folders of a project."""
+SOURCES = ("config", "docs", "neuma_lib", "profiles", "workflow")  # folders of a project
 SYSTEM = ("bin", "boot", "dev", "etc", "lib", "lib64", "proc", "sbin", "sys", "usr")
 """Folders at the root of the file system that are no place for results."""
 SAMPLED_IN_TRUTH = ("particles", "tracers", "second tracers")
 """What the seeds dataset.seed, dataset.seed + 1 and dataset.seed + 2 sample, see `neuma_lib.data.ground_truth`."""
-SHARED_BY_VIDEOS = ("law", "prior", "dt", "friction")
-"""Keys that the scenes of several videos have in common."""
+SHARED_BY_VIDEOS = ("law", "prior", "dt", "friction")  # keys that the scenes of several videos have in common
 
 
 def check_consistency(settings: Config, root: str | Path = ".") -> None:
-    """Raise an InputError that lists all problems, or all of the methods where there is no other one.
-
-    Args:
-        root: folder of the project.
-    """
+    """Raise an InputError that lists all problems, or all of the methods where there is no other one."""
     for check in (partial(_section_errors, root=root), _method_errors):
         errors: dict[str, InputError] = {}
         for error in check(settings):

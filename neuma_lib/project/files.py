@@ -14,47 +14,33 @@ from neuma_lib.methods.base import ModelSource
 
 @dataclass(frozen=True)
 class RunFiles:
-    """A predicted motion.
+    """A predicted motion."""
 
-    Attributes:
-        name, title: of the method.
-        rollout: file of the motion.
-        law: source of its law; None: the motion follows from no law.
-        gaussian_motion: how Gaussians follow their particles.
-    """
-
+    # name, title: of the method
     name: str
     title: str
-    rollout: str
-    law: ModelSource | None
-    gaussian_motion: str = "mean"
+    rollout: str  # file of the motion
+    law: ModelSource | None  # source of its law; None: the motion follows from no law
+    gaussian_motion: str = "mean"  # how Gaussians follow their particles
 
 
 @dataclass(frozen=True)
 class SceneFiles:
-    """The files of a scene.
+    """The files of a scene."""
 
-    Attributes:
-        name: the scene, with the seeds of its replicate.
-        simulation: arguments of `MPM`.
-        density: of the body, as for `load_reconstruction`.
-        particles, binding, gaussians, velocity: files of the reconstructed body.
-        truth, transforms: files of the true motion and of the observed images, or None.
-        runs: predicted motions.
-        roots: folders that may be read; other files, and links to them, are rejected.
-    """
-
-    name: str
-    simulation: dict[str, Any]
-    density: Any
+    name: str  # the scene, with the seeds of its replicate
+    simulation: dict[str, Any]  # arguments of `MPM`
+    density: Any  # of the body, as for `load_reconstruction`
+    # particles, binding, gaussians, velocity: files of the reconstructed body
     particles: str
     binding: str
     gaussians: str
     velocity: str | None
+    # truth, transforms: files of the true motion and of the observed images, or None
     truth: str | None
     transforms: str | None
-    runs: tuple[RunFiles, ...]
-    roots: tuple[str, ...]
+    runs: tuple[RunFiles, ...]  # predicted motions
+    roots: tuple[str, ...]  # folders that may be read; other files, and links to them, are rejected
 
     @property
     def files(self) -> list[str]:
@@ -74,11 +60,7 @@ class SceneFiles:
         return cls(**{**plain, "runs": tuple(runs), "roots": tuple(plain["roots"])})
 
     def checked(self, path: str | Path) -> Path:
-        """Resolved path of a file in the folders.
-
-        Raises:
-            InputError: it does not exist, or is outside the folders.
-        """
+        """Resolved path of a file in the folders. Raises InputError: it does not exist, or is outside the folders."""
         return inside(path, self.roots)
 
 

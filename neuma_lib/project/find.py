@@ -3,8 +3,6 @@
 They are in two folders: that of the results with the scene, and the corresponding folder of the data.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A simulated lab: choose an experiment with an object, render it, identify all videos together, and repeat."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -39,7 +37,6 @@ def run_lab(
     config/, so that a lab that is interrupted continues. Writes lab.json and lab.md to the folder.
 
     Args:
-        folder: results of the scene.
         files: settings on top of those of the project.
         experiments: maximum number of experiments, with the existing one.
         make: runs the workflow.

@@ -1,7 +1,5 @@
 """`load` converts merged YAML into a `Config`. It reads, draws and completes the scenes on the way."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -30,7 +28,6 @@ def load(
     Args:
         raw: the YAML as nested dicts. ``scenes_file`` (relative to ``root``) is read, random scenes are drawn, and
             ``scenes`` changes both.
-        root: folder of the project.
         captured: scenes of captures (`neuma_lib.project.capture_scenes`), which ``scenes`` may change as well.
 
     Raises:

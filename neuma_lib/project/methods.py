@@ -1,8 +1,6 @@
 """Presets of methods: named sets of options over the same code."""
 
-from __future__ import annotations
-
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -27,7 +25,7 @@ class PresetConfig(Section):
     options: dict[str, Any] = Field({}, description="options of the method that differ from their defaults")
 
     @model_validator(mode="after")
-    def _complete(self) -> PresetConfig:
+    def _complete(self) -> Self:
         if self.kind is None and self.same_fit_as is None:
             raise ValueError("kind: this key is missing")
         if self.same_fit_as and self.options:

@@ -1,7 +1,5 @@
 """Documentation and JSON schema of the public settings, which ``python -m neuma_lib.project.page`` writes."""
 
-from __future__ import annotations
-
 import inspect
 import json
 import typing
@@ -36,8 +34,7 @@ of the section `training` and of the method, and `prior`. A replicate with other
 Keys that this page does not list are internal: numerical details, documented next to their fields in
 `neuma_lib/config`. The key `advanced` sets them by their path, `advanced: {identify.spread: 2}`.
 """
-OF_A_CAPTURE = "capture.yaml"
-"""The file of settings in the folder of each capture."""
+OF_A_CAPTURE = "capture.yaml"  # the file of settings in the folder of each capture
 BOUNDS = {"gt": ">", "ge": "≥", "lt": "<", "le": "≤"}
 
 

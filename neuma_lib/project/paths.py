@@ -3,16 +3,13 @@
 No file is read or has to exist.
 """
 
-from __future__ import annotations
-
 import re
 
 from neuma_lib.config.variants import replicate_folder
 from neuma_lib.project.settings import Config
 
 FIELD = "pac_nerf/field.safetensors"
-IDENTIFIED = "identified"
-"""Name of the prior that is the law identified from the scene's video."""
+IDENTIFIED = "identified"  # name of the prior that is the law identified from the scene's video
 SEEDS_OF = {
     **dict.fromkeys(
         ["gaussians.ply", "gaussians.json", "whole.ply", "mesh.ply", "tracers.h5", FIELD], ["gaussians"]

@@ -13,10 +13,8 @@ from neuma_lib.project.capture_scenes import captured_scenes, warn_of_missing_sc
 from neuma_lib.project.loading import load, load_captures, merged, read_yaml
 from neuma_lib.project.settings import Config
 
-SETTINGS_FILE = Path("config/config.yaml")
-"""Settings of a project, below its folder."""
-REMEMBERED = "configfiles.txt"
-"""Record of the settings files of a scene's latest run, with its logs."""
+SETTINGS_FILE = Path("config/config.yaml")  # settings of a project, below its folder
+REMEMBERED = "configfiles.txt"  # record of the settings files of a scene's latest run, with its logs
 
 
 def project_folder(place: str | Path) -> Path:

@@ -36,8 +36,7 @@ REJECTIONS = {
 }
 """Why a draw is rejected."""
 OF_A_BODY = ("shape", "size", "height", "center", "velocity", "spin", "density", "law")
-NEAR = 1.0
-"""Distance of two bodies relative to the sum of their radii (`_Fall`) at which they touch."""
+NEAR = 1.0  # distance of two bodies relative to the sum of their radii (`_Fall`) at which they touch
 
 
 def draw_piles(
@@ -106,18 +105,13 @@ def without_first(scenes: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str
 
 
 class _Fall(NamedTuple):
-    """Motion of a body that falls, rotates, and stops where its box reaches the ground.
+    """Motion of a body that falls, rotates, and stops where its box reaches the ground."""
 
-    Attributes:
-        centres: of the box [m], shape (T, 3).
-        low, high: ends of a box along the axes that contains the body [m], shape (T, 3).
-        radius: of a sphere with the volume of the cube of the mean side [m].
-    """
-
-    centres: np.ndarray
+    centres: np.ndarray  # of the box [m], shape (T, 3)
+    # low, high: ends of a box along the axes that contains the body [m], shape (T, 3)
     low: np.ndarray
     high: np.ndarray
-    radius: float
+    radius: float  # of a sphere with the volume of the cube of the mean side [m]
 
     @classmethod
     def of(cls, body: Mapping[str, Any], seconds: float, gravity: Vector) -> _Fall:

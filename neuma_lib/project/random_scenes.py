@@ -5,13 +5,11 @@ Scene k depends on the seed, on k, and on the arguments of `draw_scenes`, but no
 machines have the same scenes.
 """
 
-from __future__ import annotations
-
 import colorsys
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar
+from typing import Annotated, Any, Literal, NamedTuple, Self, TypeVar
 
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, PositiveFloat, model_validator
@@ -26,19 +24,12 @@ Item = TypeVar("Item")
 
 
 class Proportions(NamedTuple):
-    """Proportions of a shape. A test compares them with `geometry.shapes`, which settings do not import.
+    """Proportions of a shape. A test compares them with `geometry.shapes`, which settings do not import."""
 
-    Attributes:
-        size: longest side where a scene does not give it [m].
-        sides: of the bounding box, the longest is 1.
-        mass_centre: centre of mass relative to the centre of the box, in the same unit.
-        parts: parts with a colour.
-    """
-
-    size: float
-    sides: Vector
-    mass_centre: Vector
-    parts: tuple[str, ...]
+    size: float  # longest side where a scene does not give it [m]
+    sides: Vector  # of the bounding box, the longest is 1
+    mass_centre: Vector  # centre of mass relative to the centre of the box, in the same unit
+    parts: tuple[str, ...]  # parts with a colour
 
 
 SHAPES = {
@@ -128,7 +119,7 @@ class FamilyConfig(Section):
         return {key: part for key in names if (part := getattr(self, key))}
 
     @model_validator(mode="after")
-    def _has_a_wave_speed(self) -> FamilyConfig:
+    def _has_a_wave_speed(self) -> Self:
         ranges = self.elasticity.ranges
         if not {"E", "nu"} <= set(ranges) or ranges["nu"][1] >= 0.5:
             raise ValueError("elasticity: give ranges of E and nu, and nu below 0.5")
@@ -200,7 +191,7 @@ class RandomConfig(Section):
     )
 
     @model_validator(mode="after")
-    def _has_seeds_of_one_kind(self) -> RandomConfig:
+    def _has_seeds_of_one_kind(self) -> Self:
         if both := sorted({*self.development_seeds} & {*self.reported_seeds}):
             raise ValueError(f"development_seeds: {both[0]} is also one of reported_seeds")
         return self

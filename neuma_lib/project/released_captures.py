@@ -1,7 +1,5 @@
 """Released captures: which of their files show an object. `neuma_lib.capture.released` reads them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -11,8 +9,7 @@ from neuma_lib.errors import InputError
 from neuma_lib.io.files import existing, read_json
 from neuma_lib.project.capture_folder import Capture
 
-TAKE = "first"
-"""Name of the only take."""
+TAKE = "first"  # name of the only take
 GROUND = {"bun": -0.010, "burger": -0.025, "dog": -0.025, "pig": -0.025, "potato": -0.010}
 """z of the floor under each object in Spring-Gaus' settings."""
 UNPACK = "Unpack the archive again"

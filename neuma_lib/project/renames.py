@@ -1,7 +1,5 @@
 """Keys of the settings that have another name now."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -35,8 +33,7 @@ RENAMED = {
     "tables.*.on_request": "tables.*.default_target",
 }
 """Old path -> new path. A star is the name of a scene, method or table."""
-OPPOSITE = {"tables.*.on_request"}
-"""Old keys whose values are the opposite of the new ones."""
+OPPOSITE = {"tables.*.on_request"}  # old keys whose values are the opposite of the new ones
 
 
 def refuse_old_keys(raw: Mapping[str, Any]) -> None:

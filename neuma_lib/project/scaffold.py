@@ -1,7 +1,5 @@
 """New settings files of a project: a scene, a capture."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
@@ -85,7 +83,6 @@ def new_scene(root: Path, name: str, settings: Config, mesh: str | Path | None =
     """Write config/<name>.yaml with a scene of that name.
 
     Args:
-        root: folder of the project.
         mesh: file with the shape of the object; None: a duck. It is copied to meshes/ if it is outside the project.
 
     Raises:
@@ -116,7 +113,6 @@ def next_scene(root: Path, name: str, settings: Config, folder: Path, rank: int 
     second camera changes the views of the existing scene.
 
     Args:
-        root: folder of the project.
         folder: results of the scene, with next.json.
         rank: of the experiment, from 1.
 

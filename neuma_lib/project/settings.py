@@ -3,8 +3,6 @@
 `neuma_lib.project.loading` builds it from YAML and checks that sections agree (`neuma_lib.project.consistency`).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any, Literal

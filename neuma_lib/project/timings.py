@@ -1,7 +1,5 @@
 """Wall time, core seconds and memory of the stages of a results folder, from benchmark files and logs."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -18,8 +16,7 @@ COLUMNS = {
     "start": "of these to start",
     "memory": "most memory [MB]",
 }
-MAXIMA = ("longest", "memory")
-"""Columns that hold the maximum over the runs; the others hold the sum."""
+MAXIMA = ("longest", "memory")  # columns that hold the maximum over the runs; the others hold the sum
 
 _USED = re.compile(r"core seconds: ([\d.]+) to start, ([\d.]+) of work(?:; memory: ([\d.]+) MB)?")
 

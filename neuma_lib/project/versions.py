@@ -1,7 +1,5 @@
 """Versions of Python and of packages whose updates change results, as installed now and in the logs of jobs."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import platform
 import re

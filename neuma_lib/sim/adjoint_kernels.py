@@ -5,7 +5,6 @@ stencil and vice versa, so `g2p_adjoint` reads like P2G and `p2g_adjoint` like G
 position is dw_i/dx = N'_i / dx, that of an offset d_i = x_i - x is -I.
 """
 
-# No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
 import functools
 from types import SimpleNamespace
 

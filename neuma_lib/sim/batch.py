@@ -1,7 +1,5 @@
 """Several simulations of a body with different laws or initial states, in the same launches or in threads."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Sequence
 from itertools import chain

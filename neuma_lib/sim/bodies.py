@@ -1,7 +1,5 @@
 """Bodies that touch each other on one grid."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

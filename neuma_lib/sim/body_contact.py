@@ -18,7 +18,6 @@ This is the impact of a Coulomb friction without rebound. Bodies rebound by thei
 is scarce. Momentum is conserved. Bodies that part are free.
 """
 
-# No `from __future__ import annotations` here: Warp reads the annotations of functions as objects.
 import functools
 from types import SimpleNamespace
 

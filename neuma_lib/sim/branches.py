@@ -6,8 +6,6 @@ velocities stay equal, while the deformation gradient of the branch relaxes. Ker
 those of any particles.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

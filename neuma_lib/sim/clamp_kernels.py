@@ -1,6 +1,5 @@
 """Clamped particles and held nodes as Warp functions. `clamps.Clamp` has the rules."""
 
-# No `from __future__ import annotations` here: Warp reads the annotations of functions as objects.
 import functools
 from collections.abc import Sequence
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Regions of a body that follow a prescribed rigid motion."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

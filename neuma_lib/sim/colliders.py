@@ -29,16 +29,11 @@ class DistanceGrid:
     Within a cell it is interpolated trilinearly. Outside the grid, whose outer nodes must be outside the surface, a
     point at the distance a from the grid has the distance sqrt(a^2 + d^2), with the interpolated d of the nearest point
     of the grid. That is a lower bound, exact next to a vertex of the surface.
-
-    Attributes:
-        values: distances [m], shape (I, J, K), at least two nodes along an axis.
-        lowest: position of the first node [m].
-        spacing: of the nodes [m].
     """
 
-    values: np.ndarray
-    lowest: Vector
-    spacing: float
+    values: np.ndarray  # distances [m], shape (I, J, K), at least two nodes along an axis
+    lowest: Vector  # position of the first node [m]
+    spacing: float  # of the nodes [m]
     digest: bytes = field(init=False, repr=False)
 
     def __post_init__(self):

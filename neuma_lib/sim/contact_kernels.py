@@ -3,7 +3,6 @@
 `colliders.Collider` has the equations. Several colliders act one after the other.
 """
 
-# No `from __future__ import annotations` here: Warp reads the annotations of functions as objects.
 import functools
 from collections.abc import Sequence
 from types import SimpleNamespace
@@ -18,8 +17,7 @@ from neuma_lib.sim.colliders import CONTACT_STIFFNESS, SIZES, Collider
 start_warp()
 
 CODES = {shape: code for code, shape in enumerate(SIZES)}
-STICKING = 1e12
-"""Finite coefficient in place of infinity, whose adjoint would be infinity times zero."""
+STICKING = 1e12  # finite coefficient in place of infinity, whose adjoint would be infinity times zero
 BOX, CAPSULE, MESH = CODES["box"], CODES["capsule"], CODES["mesh"]
 ROUND = (CODES["sphere"], CAPSULE)
 

@@ -10,8 +10,6 @@ equilibrium of a nearly incompressible beam is reached in a second instead of af
 exactly at a face, and a second mesh measures the error of discretisation.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass

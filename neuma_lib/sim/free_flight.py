@@ -1,7 +1,5 @@
 """Closed-form steps before the first contact, for an undeformed body with uniform velocity."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

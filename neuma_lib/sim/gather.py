@@ -1,6 +1,5 @@
 """Gather from grid nodes: the sums over the stencil of a particle in g2p and in the adjoint of p2g."""
 
-# No `from __future__ import annotations` here: Warp reads the annotations of functions as objects.
 import functools
 
 import torch

@@ -4,15 +4,12 @@ A rollout consists of thousands of kernels that take less time than their launch
 steps is therefore recorded once and replayed, on buffers with fixed addresses (`Workspace`).
 """
 
-from __future__ import annotations
-
 import gc
 from collections.abc import Callable, Hashable
 
 import torch
 
-MAX_GRAPHS = 16
-"""Graphs kept by a `GraphCache`, which drops the least recently used one."""
+MAX_GRAPHS = 16  # graphs kept by a `GraphCache`, which drops the least recently used one
 
 
 class GraphCache:

@@ -17,7 +17,6 @@ Copies: several independent simulations with equal numbers of particles are stor
 of particles and of nodes. Each body of a copy has its own nodes (`body_contact`).
 """
 
-# No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
 import functools
 from types import SimpleNamespace
 
@@ -35,14 +34,11 @@ from neuma_lib.sim.warp_types import typed, warp_types
 
 start_warp()
 
-NO_SLIP, SLIP, STICKY = 0, 1, 2
-"""Codes of the boundary conditions in ``GridConstants.walls``."""
+NO_SLIP, SLIP, STICKY = 0, 1, 2  # codes of the boundary conditions in ``GridConstants.walls``
 
-NO_FAULT = 2**62
-"""Value of a fault flag without a fault."""
+NO_FAULT = 2**62  # value of a fault flag without a fault
 
-NO_CONTACT = -1e3
-"""Radius [m] of clamped particles, which touch no collider."""
+NO_CONTACT = -1e3  # radius [m] of clamped particles, which touch no collider
 
 
 @functools.cache

@@ -1,7 +1,5 @@
 """Memory plan of a differentiable rollout: gradient checkpointing with a cache."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

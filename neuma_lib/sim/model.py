@@ -26,8 +26,7 @@ Condition = str | float
 """Condition of a wall: one of `CONDITIONS`, or a Coulomb coefficient."""
 _FRICTION = {"no_slip": math.inf, "slip": 0.0}
 _NAMED = {friction: name for name, friction in _FRICTION.items()}
-_OUTSIDE = 2
-"""Nodes outside the cube at either end of an axis, wall nodes if ``contact`` is "nodes"."""
+_OUTSIDE = 2  # nodes outside the cube at either end of an axis, wall nodes if ``contact`` is "nodes"
 
 
 @dataclass(frozen=True)

@@ -19,22 +19,15 @@ AT_REST = {"velocity": (0.0, 0.0, 0.0), "spin": (0.0, 0.0, 0.0), "keyframes": ()
 
 
 class Motion:
-    """Pose of a frame over time. Base of frozen dataclasses with these fields:
+    """Pose of a frame over time. Base of frozen dataclasses with these fields:"""
 
-    Attributes:
-        centre: origin of the frame at t = 0 [m].
-        rotation: rotation vector of the frame at t = 0 [rad].
-        velocity: of the centre [m/s].
-        spin: angular velocity about the centre [rad/s].
-        keyframes: poses (time [s], centre [m], rotation vector [rad]) in place of the other four, with ascending times.
-            Between two of them the centre moves at constant velocity and the frame turns by the smallest angle at
-            constant angular velocity. Before the first and after the last it rests.
-    """
-
-    centre: Vector
-    rotation: Vector
-    velocity: Vector
-    spin: Vector
+    centre: Vector  # origin of the frame at t = 0 [m]
+    rotation: Vector  # rotation vector of the frame at t = 0 [rad]
+    velocity: Vector  # of the centre [m/s]
+    spin: Vector  # angular velocity about the centre [rad/s]
+    # poses (time [s], centre [m], rotation vector [rad]) in place of the other four, with ascending times.
+    # Between two of them the centre moves at constant velocity and the frame turns by the smallest angle at
+    # constant angular velocity. Before the first and after the last it rests.
     keyframes: tuple[tuple[float, Vector, Vector], ...]
 
     def check_motion(self, name: str) -> None:

@@ -16,8 +16,7 @@ from neuma_lib.sim.transfers import transfer_kernels
 if TYPE_CHECKING:
     from neuma_lib.sim.workspace import Workspace
 
-PADDING = 1
-"""Nodes beyond the end of a grid, which the loops read and write with the three before them."""
+PADDING = 1  # nodes beyond the end of a grid, which the loops read and write with the three before them
 
 
 class NativeTransfers:

@@ -1,7 +1,5 @@
 """Rollouts that are held at their last valid frame after a failure."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

@@ -6,8 +6,6 @@ elastic and bears them at a small strain leaves the body rigid, so its centre mo
 conserves angular momentum.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch
@@ -17,8 +15,7 @@ from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.model import MPM, law_weights
 from neuma_lib.sim.state import State, Trajectory, cross_matrix
 
-MAX_STRAIN = 0.01
-"""Strain at which a law must bear the centrifugal stress."""
+MAX_STRAIN = 0.01  # strain at which a law must bear the centrifugal stress
 _MAX_ANGLE = 0.05  # rotation in a step of the integration [rad]
 
 
@@ -50,7 +47,6 @@ def rigid_flight(model: MPM, state: State, steps: Sequence[int], total: bool = F
     inertia I at n = 0 and the constant angular momentum L, by the Runge-Kutta method of fourth order.
 
     Args:
-        model: time step and gravity.
         state: undeformed particles in rigid motion.
         steps: steps of the returned states, increasing.
         total: whether the total deformation is also returned, equal to F.

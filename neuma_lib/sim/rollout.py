@@ -5,8 +5,6 @@ gradient is one reverse loop over the stored states. The total deformation and, 
 displacements of friction are further parts of the state.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Sequence
 from functools import cache

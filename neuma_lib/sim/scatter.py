@@ -10,7 +10,6 @@ The 27 contributions of a particle overlap with those of its neighbours. There a
   numbers, for tests. Sorting affects only the speed.
 """
 
-# No `from __future__ import annotations` here: Warp reads the annotations of functions as objects.
 import functools
 
 import torch
@@ -33,7 +32,6 @@ def scatter_functions(dtype: torch.dtype, scatter: str, components: int) -> tupl
     """Functions `run_of` and `deposit` for kernels with one particle per thread.
 
     Args:
-        dtype: precision.
         scatter: "atomic", "runs" or "runs_scalar".
         components: 4 if nodes carry momentum and mass, 3 if the last of their four numbers stays zero.
 

@@ -22,8 +22,7 @@ from neuma_lib.sim.workspace import Workspace
 
 PARTICLE_STEPS = 1_000_000
 """Particles times steps in one call, which takes up to 0.3 s on a slow core. Signals wait for its end."""
-SLOWER = 8
-"""Factor for networks."""
+SLOWER = 8  # factor for networks
 
 Parts = Mapping[str, Sequence[tuple[Constitutive, slice, Weights]]]
 """For elasticity and plasticity: law, particles and weights of each region."""

@@ -5,7 +5,6 @@ addresses. For each step a native loop writes the arguments that depend on the s
 any call of ctypes other Python threads run, but signals wait, so that calls have to be short.
 """
 
-# No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
 import ctypes
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -18,8 +17,7 @@ from neuma_lib.device import start_warp
 
 start_warp()
 
-FOREVER = 2**62
-"""Modulus of an index that is the step itself."""
+FOREVER = 2**62  # modulus of an index that is the step itself
 
 
 class Index(NamedTuple):

@@ -10,7 +10,6 @@
   Clamped particles have no mass in ``mass_now``.
 """
 
-# No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
 import functools
 from types import SimpleNamespace
 

@@ -3,7 +3,6 @@
 Arguments of one name have one type in all kernels and functions. Only exceptions have an annotation.
 """
 
-# No `from __future__ import annotations` here: Warp reads the annotations of structs as objects.
 import functools
 from types import SimpleNamespace
 
@@ -27,8 +26,7 @@ OF_STEPS = {
 }
 """Arrays whose first axis is the step. Functions get the row of one step."""
 
-TABLES = {"Obstacle": "obstacles", "Hold": "holds", "real": "pairs", "int64": "faults"}
-"""Arrays of two axes."""
+TABLES = {"Obstacle": "obstacles", "Hold": "holds", "real": "pairs", "int64": "faults"}  # arrays of two axes
 
 ARRAYS = {
     "real": "mass vol0 radius mass_now vol_now radius_now held_mass distances",

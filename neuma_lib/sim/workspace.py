@@ -3,8 +3,6 @@
 Nothing is allocated per step. Launches are recorded with fixed memory and only their indices change.
 """
 
-from __future__ import annotations
-
 import math
 import threading
 import weakref
@@ -30,8 +28,7 @@ from neuma_lib.sim.native import NativeTransfers
 from neuma_lib.sim.warp_types import warp_types
 from neuma_lib.threads import thread_count
 
-SORT_EVERY = 16
-"""Steps between sorts of the particles by cell, for scatter methods that need it."""
+SORT_EVERY = 16  # steps between sorts of the particles by cell, for scatter methods that need it
 
 BLOCK = 64
 """Threads per block on a GPU. Small blocks distribute better, since 30,000 particles are few for a GPU."""

@@ -1,7 +1,5 @@
 """Checks of the tensors passed to Warp kernels."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from torch import Tensor

@@ -14,8 +14,6 @@
 ``splats`` and ``depths`` are results of ``projection``, ``empty(name, shape, like, dtype)`` allocates.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 

@@ -29,8 +29,6 @@ gradients, 130 per splat and image, 16 per list entry, of which 8 remain for the
 in total, and accesses only those of tiles with splats.
 """
 
-from __future__ import annotations
-
 import functools
 import re
 

@@ -4,8 +4,6 @@
 oversized and isolated Gaussians, thins the rest, and rotates and moves the object to its initial position.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 
@@ -20,10 +18,8 @@ from neuma_lib.errors import InputError
 from neuma_lib.splatting.gaussians import Gaussians, quaternions, rotations
 from neuma_lib.splatting.spherical_harmonics import rotated
 
-_NEIGHBOURS = 16
-"""Number of nearest Gaussians that may be linked."""
-_SPACING_NEIGHBOUR = 4
-"""The spacing is the median distance to this neighbour."""
+_NEIGHBOURS = 16  # number of nearest Gaussians that may be linked
+_SPACING_NEIGHBOUR = 4  # the spacing is the median distance to this neighbour
 _TOUCHING = 2.0
 """Standard deviations along the middle axis within which Gaussians are linked, so that needles do not link."""
 _OUTSIDE_SHARE = 0.05

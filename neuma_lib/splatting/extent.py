@@ -1,15 +1,12 @@
 """Visible extent of Gaussians, which is larger than that of their centres."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from torch import Tensor
 
 from neuma_lib.splatting.viewpoints import sphere_directions
 
-SEEN = 0.05
-"""Alpha at the border of a Gaussian."""
+SEEN = 0.05  # alpha at the border of a Gaussian
 DIRECTIONS = 100
 """Number of tangent planes in addition to those normal to the axes. Ellipsoids exceed the convex hull by a few percent
 of their largest half-axis."""

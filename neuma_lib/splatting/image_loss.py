@@ -3,8 +3,6 @@
 (``rasterizer.rasterized_error`` needs no rendered images if the compositor supports it.)
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

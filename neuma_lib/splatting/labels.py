@@ -1,7 +1,5 @@
 """Division of Gaussians into bodies by labelled images, and the bodies behind others."""
 
-from __future__ import annotations
-
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
@@ -27,10 +25,8 @@ def bodies_of(gaussians: Gaussians, cameras: Cameras, labels: Tensor, count: int
     body or hidden, belong to the body of the nearest one that is visible.
 
     Args:
-        gaussians: all Gaussians of the scene.
         cameras: V cameras.
         labels: number of the visible body in each pixel, from 1, or 0 for none, shape (V, H, W).
-        count: number of bodies.
 
     Raises:
         InputError: the labels have another shape, or no Gaussian is visible in the pixels of a body.
@@ -71,7 +67,6 @@ def without_others(gaussians: Gaussians, cameras: Cameras, images: Tensor, hidde
     """Images of a body, completed where others hide it by renders of its Gaussians, shape (V, H, W, 4).
 
     Args:
-        gaussians: those of the body.
         cameras: V cameras.
         images: straight-alpha RGBA in [0, 1] of its visible part, shape (V, H, W, 4).
         hidden: pixels that show another body, shape (V, H, W).

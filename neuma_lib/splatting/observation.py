@@ -18,8 +18,7 @@ from torch import Tensor
 from neuma_lib.errors import InputError
 from neuma_lib.splatting.cameras import Cameras
 
-_MIN_SHARE = 0.01
-"""Minimum fraction of a step's time covered by an exposure for the step to be rendered."""
+_MIN_SHARE = 0.01  # minimum fraction of a step's time covered by an exposure for the step to be rendered
 _DEVICE_SHARE = 0.3
 """Maximum fraction of a GPU's free memory for a video; the rollout and the renders need the rest."""
 
@@ -120,11 +119,7 @@ class Observation:
 
 
 def several(videos: Observation | Sequence[Observation]) -> tuple[Observation, ...]:
-    """One or several videos of one motion as a tuple.
-
-    Raises:
-        InputError: no video, or one without frames.
-    """
+    """One or several videos of one motion as a tuple. Raises InputError: no video, or one without frames."""
     result = (videos,) if isinstance(videos, Observation) else tuple(videos)
     if not result or not all(video.frames for video in result):
         raise InputError("videos", "there must be at least one video, and each must have a frame")

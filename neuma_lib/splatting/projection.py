@@ -21,14 +21,11 @@ from neuma_lib.splatting.spherical_harmonics import SH_C0, SH_C1, SH_C2, SH_C3
 
 start_warp()
 
-NEAR_PLANE = 0.01
-"""Depth [m] below which a Gaussian is culled."""
+NEAR_PLANE = 0.01  # depth [m] below which a Gaussian is culled
 REACH_SLACK = 0.02
 """Added to the reach so that round-off excludes no pixel; the compositors test alpha itself."""
-UNLIMITED = 1.0e20
-"""Reach for alpha_min = 0."""
-CULLED = 1.0e30
-"""Depth of Gaussians that are invisible in an image."""
+UNLIMITED = 1.0e20  # reach for alpha_min = 0
+CULLED = 1.0e30  # depth of Gaussians that are invisible in an image
 
 
 def for_device(sh: torch.Tensor) -> torch.Tensor:

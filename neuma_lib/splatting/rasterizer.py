@@ -5,8 +5,6 @@ by splat (``compositor_cpu``), GPUs tile by tile (``compositor_cuda``). If only 
 compositor compares with the observation directly (``rasterized_error``).
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence

@@ -3,7 +3,6 @@
 Vector loads of 16 bytes avoid twelve uncoalesced accesses per record.
 """
 
-# No `from __future__ import annotations` here: Warp reads the annotations of functions as objects.
 import functools
 
 import torch

@@ -1,7 +1,5 @@
 """Similarity transformations of Gaussians."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

@@ -4,28 +4,20 @@ World frame: y up [m]. A pose is a camera-to-world matrix with OpenGL axes (x ri
 ``transforms.json`` and in Blender. The centre of pixel (0, 0) is at (0.5, 0.5), y of the image points down.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
 
-FIELD_OF_VIEW = 30.0
-"""Full horizontal field of view of every camera [degrees], narrow for weak perspective."""
+FIELD_OF_VIEW = 30.0  # full horizontal field of view of every camera [degrees], narrow for weak perspective
 
 
 @dataclass(frozen=True)
 class Views:
-    """Pinhole cameras with common intrinsics, square pixels, and the principal point at the image centre.
+    """Pinhole cameras with common intrinsics, square pixels, and the principal point at the image centre."""
 
-    Attributes:
-        c2w: camera-to-world matrices, OpenGL axes, shape (V, 4, 4) [m].
-        focal: focal length [px].
-        width, height: image size [px].
-    """
-
-    c2w: np.ndarray
-    focal: float
+    c2w: np.ndarray  # camera-to-world matrices, OpenGL axes, shape (V, 4, 4) [m]
+    focal: float  # focal length [px]
+    # width, height: image size [px]
     width: int
     height: int
 

@@ -258,7 +258,9 @@ def test_same_job_same_bytes_and_moving_mesh(tmp_path):
     done = []
     (tmp_path / "b" / ".render-abandoned").mkdir(parents=True)
     for folder in ("a", "b"):
-        render_dynamic(body, views, [0, 8], 1e-3, tmp_path / folder, 4, 1, lambda *count: done.append(count))
+        render_dynamic(
+            body, views, [0, 8], 1e-3, tmp_path / folder, 4, progress=lambda *count: done.append(count)
+        )
     assert done == [(k, 4) for k in (1, 2, 3, 4)] * 2
     names = sorted(p.name for p in (tmp_path / "a").iterdir())
     assert names == ["d_0_0000.png", "d_0_0008.png", "d_1_0000.png", "d_1_0008.png", "transforms.json"]

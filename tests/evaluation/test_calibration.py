@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.calibration import measured_quantiles
 from neuma_lib.evaluation import calibration
 from neuma_lib.evaluation.bands import band
 from neuma_lib.evaluation.calibration import (
@@ -21,7 +22,6 @@ from neuma_lib.evaluation.calibration import (
     family_probabilities,
     interval,
     kind_of,
-    measured_quantiles,
     quantiles_of,
 )
 from tests.support.errors import refused

@@ -7,14 +7,9 @@ import math
 import numpy as np
 import pytest
 
+from benchmarks.calibration import TEMPERATURES, fitted_temperature
 from neuma_lib.evaluation.calibration import NORMAL
-from neuma_lib.evaluation.coverage import (
-    TEMPERATURES,
-    Intervals,
-    brier_score,
-    fitted_temperature,
-    mean_over_scenes,
-)
+from neuma_lib.evaluation.coverage import Intervals, brier_score, mean_over_scenes
 
 pytestmark = pytest.mark.core
 

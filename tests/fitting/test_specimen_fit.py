@@ -18,9 +18,9 @@ from neuma_lib.io.markers import read_markers
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.sim.clamps import Clamp
 from neuma_lib.sim.equilibrium import solve_equilibrium
-from neuma_lib.sim.settle import settle
 from tests.support.errors import refused
 from tests.support.markers import write_markers
+from tests.support.settle import settle
 
 BEAM = Beam(0.1, 0.03, 0.03, 1070.0)
 LAW = {

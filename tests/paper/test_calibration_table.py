@@ -8,9 +8,16 @@ import io
 import numpy as np
 import pytest
 
-from benchmarks.calibration import calibrated, cross_validated, errors_by_quantity, main, report
+from benchmarks.calibration import (
+    calibrated,
+    cross_validated,
+    errors_by_quantity,
+    main,
+    measured_quantiles,
+    report,
+)
 from neuma_lib.evaluation import calibration
-from neuma_lib.evaluation.calibration import GRID, LEVELS, MATERIAL, MOTION, measured_quantiles
+from neuma_lib.evaluation.calibration import GRID, LEVELS, MATERIAL, MOTION
 from neuma_lib.fitting.families import FRICTION
 from neuma_lib.io.files import write_json
 from neuma_lib.paper.calibration_record import constants_with_truths, families_with_truth

@@ -13,9 +13,9 @@ from neuma_lib.sim.clamps import Clamp, clamped_particles
 from neuma_lib.sim.colliders import Collider
 from neuma_lib.sim.model import MPM, as_regions
 from neuma_lib.sim.rollout import rollout
-from neuma_lib.sim.settle import settle
 from neuma_lib.sim.state import State
 from tests.support.errors import refused
+from tests.support.settle import settle
 from tests.support.sim_scenes import DENSITY, DT, cube, loss_of, make_law, moving_cube, prism, strained
 
 pytestmark = pytest.mark.core

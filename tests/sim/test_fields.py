@@ -10,9 +10,9 @@ from neuma_lib.sim.batch import rollout_batch
 from neuma_lib.sim.clamps import Clamp
 from neuma_lib.sim.model import MPM, MaterialRegion, with_fields
 from neuma_lib.sim.rollout import rollout
-from neuma_lib.sim.settle import settle
 from neuma_lib.sim.state import State
 from tests.support.errors import refused
+from tests.support.settle import settle
 from tests.support.sim_scenes import DT, SPECS, cube, loss_of, prism, strained
 
 pytestmark = pytest.mark.core

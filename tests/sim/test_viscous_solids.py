@@ -15,9 +15,9 @@ from neuma_lib.sim.clamps import Clamp
 from neuma_lib.sim.colliders import Collider
 from neuma_lib.sim.model import MPM, MaterialRegion
 from neuma_lib.sim.rollout import rollout
-from neuma_lib.sim.settle import settle
 from neuma_lib.sim.state import State
 from tests.support.errors import refused
+from tests.support.settle import settle
 from tests.support.sim_scenes import DENSITY, DT, cube, loss_of, prism, strained
 
 pytestmark = pytest.mark.core

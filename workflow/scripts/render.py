@@ -50,11 +50,11 @@ def main(inputs, output, params, run) -> None:
                 "colliders", problem, f"Move them. At least {MIN_VIEWS} views must see all of it"
             )
         views = replace(views, c2w=views.c2w[whole])
-    how = (folder, images.samples, params.threads, run.progress, params.device, around)
+    how = {"threads": params.threads, "progress": run.progress, "device": params.device, "obstacles": around}
     if params.moving:
-        render_dynamic(body, views, steps, attributes["dt"], *how)
+        render_dynamic(body, views, steps, attributes["dt"], folder, images.samples, **how)
     else:
-        render_static(body, views, *how)
+        render_static(body, views, folder, images.samples, **how)
     run.log(f"{len(views)} views, {len(steps)} frames of {views.width}x{views.height} px")
 
 

@@ -28,8 +28,7 @@ _MARGIN = 0.010  # unprintable border of the page [m]
 _FOOT = 0.024  # strip under the squares for the ruler and the text [m]
 _RULER = 0.100  # length of the printed ruler [m]
 _MIN_CORNERS = 6  # corners required for a pose
-NEIGHBOURS = 13
-"""Number of nearest corners, including itself, used to predict the position of a corner."""
+NEIGHBOURS = 13  # number of nearest corners, including itself, used to predict the position of a corner
 NEIGHBOUR_TOLERANCE = (0.4, 0.005)
 """Tolerated distance of a corner from its prediction: pixels, and share of a square's side."""
 MIN_ANGLE = np.deg2rad(3.0)
@@ -51,21 +50,13 @@ class Detection:
 
 @dataclass(frozen=True, eq=False)
 class BoardFit:
-    """Pose and scale of the board in a reconstruction.
+    """Pose and scale of the board in a reconstruction."""
 
-    Attributes:
-        board_from_world: the similarity from the reconstruction to the board's frame.
-        corners: numbers of the corners used, (N,).
-        residual: root-mean-square distance between triangulated and printed corners [m].
-        flatness: its component normal to the print [m].
-        pictures: number of pictures that show the board.
-    """
-
-    board_from_world: Similarity
-    corners: np.ndarray
-    residual: float
-    flatness: float
-    pictures: int
+    board_from_world: Similarity  # the similarity from the reconstruction to the board's frame
+    corners: np.ndarray  # numbers of the corners used, (N,)
+    residual: float  # root-mean-square distance between triangulated and printed corners [m]
+    flatness: float  # its component normal to the print [m]
+    pictures: int  # number of pictures that show the board
 
     def plain(self) -> dict:
         """Entries of a report, lengths in millimetres."""

@@ -16,8 +16,7 @@ import numpy as np
 from neuma_lib.capture.tools import opencv
 from neuma_lib.errors import InputError
 
-HALF_PIXEL = 0.5
-"""Offset from OpenCV's pixel coordinates to ours."""
+HALF_PIXEL = 0.5  # offset from OpenCV's pixel coordinates to ours
 COLMAP_MODELS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
     "PINHOLE": ("fx", "fy", "cx", "cy"),
@@ -32,18 +31,13 @@ _INVERSION = (3, 100, 1e-12)
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """Intrinsics of a camera.
+    """Intrinsics of a camera."""
 
-    Attributes:
-        width, height: of its pictures [px].
-        K: (3, 3) [px], no skew.
-        distortion: k1, k2, p1, p2, k3 of Brown and Conrady, as in OpenCV.
-    """
-
+    # width, height: of its pictures [px]
     width: int
     height: int
-    K: np.ndarray
-    distortion: np.ndarray
+    K: np.ndarray  # (3, 3) [px], no skew
+    distortion: np.ndarray  # k1, k2, p1, p2, k3 of Brown and Conrady, as in OpenCV
 
     def project(self, points: np.ndarray) -> np.ndarray:
         """Project points (N, 3) in the camera's frame, z > 0, to pixels (N, 2)."""

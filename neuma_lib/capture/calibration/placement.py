@@ -10,8 +10,7 @@ import numpy as np
 
 from neuma_lib.errors import InputError
 
-RANSAC_DRAWS = 2000
-"""RANSAC samples: 99 % probability of sampling the floor if it has 14 % of the points."""
+RANSAC_DRAWS = 2000  # RANSAC samples: 99 % probability of sampling the floor if it has 14 % of the points
 
 
 @dataclass(frozen=True, eq=False)

@@ -49,29 +49,19 @@ _MAX_STRETCH = 0.01  # relative difference between the focal lengths of the two 
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """Cameras of pictures, in one world.
+    """Cameras of pictures, in one world."""
 
-    Attributes:
-        names: of the pictures, (N,).
-        lenses: of each picture, (N,).
-        viewmats: world to camera, (N, 4, 4).
-        points: of the scene, (P, 3).
-        colours: of the points, (P, 3), uint8.
-        sightings: numbers of the points that each picture shows, N arrays. Empty if unknown.
-        error: mean reprojection error [px].
-        lost: names of pictures that were not registered.
-        unsure: for pictures of fixed cameras with an estimated lens, by name: standard deviations of the principal
-            point in x and y [px], and of the direction about its worst axis [degrees].
-    """
-
-    names: tuple[str, ...]
-    lenses: tuple[Lens, ...]
-    viewmats: np.ndarray
-    points: np.ndarray
-    colours: np.ndarray
-    error: float
-    lost: tuple[str, ...] = ()
+    names: tuple[str, ...]  # of the pictures, (N,)
+    lenses: tuple[Lens, ...]  # of each picture, (N,)
+    viewmats: np.ndarray  # world to camera, (N, 4, 4)
+    points: np.ndarray  # of the scene, (P, 3)
+    colours: np.ndarray  # of the points, (P, 3), uint8
+    error: float  # mean reprojection error [px]
+    lost: tuple[str, ...] = ()  # names of pictures that were not registered
+    # for pictures of fixed cameras with an estimated lens, by name: standard deviations of the principal
+    # point in x and y [px], and of the direction about its worst axis [degrees]
     unsure: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    # numbers of the points that each picture shows, N arrays. Empty if unknown.
     sightings: tuple[np.ndarray, ...] = ()
 
     def seen(self, names: Sequence[str]) -> np.ndarray:

@@ -18,12 +18,10 @@ from scipy.spatial.transform import Rotation
 
 from neuma_lib.capture.calibration.lens import Lens
 
-MIN_POINTS = 30
-"""Points required to fit the lens of a picture."""
+MIN_POINTS = 30  # points required to fit the lens of a picture
 OFF_CENTRE = 0.01
 """Prior standard deviation of the principal point from the centre, as share of the longer side."""
-RADIAL = (0.3, 0.1)
-"""Prior standard deviations of k1 and k2."""
+RADIAL = (0.3, 0.1)  # prior standard deviations of k1 and k2
 _OUTLIER = 3.0  # scale of the Cauchy loss, in standard deviations
 _ROUNDS = 4  # of weights, which depend on the pose and on the noise of the picture
 _STEP = 1e-5  # of numeric derivatives, relative to the distance of the points
@@ -32,36 +30,22 @@ _MAX_STEP = 0.2  # of a point in one iteration, relative to the spread of all
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
-    """Observations of points by a camera.
+    """Observations of points by a camera."""
 
-    Attributes:
-        lens: of the camera.
-        viewmat: world to camera, (4, 4).
-        points: numbers of the points, (N,).
-        pixels: (N, 2).
-    """
-
-    lens: Lens
-    viewmat: np.ndarray
-    points: np.ndarray
-    pixels: np.ndarray
+    lens: Lens  # of the camera
+    viewmat: np.ndarray  # world to camera, (4, 4)
+    points: np.ndarray  # numbers of the points, (N,)
+    pixels: np.ndarray  # (N, 2)
 
 
 @dataclass(frozen=True, eq=False)
 class Resected:
-    """A fixed camera.
+    """A fixed camera."""
 
-    Attributes:
-        lens: with square pixels, k1 and k2.
-        viewmat: world to camera, (4, 4).
-        centre_deviation: standard deviation of the principal point, (2,) [px].
-        turn_deviation: standard deviation of the direction about the worst axis [degrees].
-    """
-
-    lens: Lens
-    viewmat: np.ndarray
-    centre_deviation: np.ndarray
-    turn_deviation: float
+    lens: Lens  # with square pixels, k1 and k2
+    viewmat: np.ndarray  # world to camera, (4, 4)
+    centre_deviation: np.ndarray  # standard deviation of the principal point, (2,) [px]
+    turn_deviation: float  # standard deviation of the direction about the worst axis [degrees]
 
 
 def triangulated(

@@ -50,8 +50,7 @@ _MARK = (
     1.5,
     0.001,
 )  # standard deviation of a marked point [px], and as share of the longer side of the photograph
-BOX_MIDDLE = (0.5, 0.0, 0.5)
-"""Position of the room's origin, on the floor, in the simulation box [m]."""
+BOX_MIDDLE = (0.5, 0.0, 0.5)  # position of the room's origin, on the floor, in the simulation box [m]
 
 
 @dataclass(frozen=True)
@@ -64,23 +63,15 @@ class Scale:
 
 @dataclass(frozen=True, eq=False)
 class Room:
-    """Poses in metres, y up, the floor at y = 0.
+    """Poses in metres, y up, the floor at y = 0."""
 
-    Attributes:
-        poses: in the room.
-        room_from_world: from the world of the estimated poses.
-        board: fit of the board. None without one.
-        floor: share of the points near the fitted floor. None with a board.
-        scale: where the metre comes from. None if the length of the room's unit is unknown.
-        cues: upward directions in the room, the one that defines the room's y first.
-    """
-
-    poses: Poses
-    room_from_world: Similarity
-    board: BoardFit | None = None
-    floor: float | None = None
+    poses: Poses  # in the room
+    room_from_world: Similarity  # from the world of the estimated poses
+    board: BoardFit | None = None  # fit of the board. None without one.
+    floor: float | None = None  # share of the points near the fitted floor. None with a board.
+    # where the metre comes from. None if the length of the room's unit is unknown.
     scale: Scale | None = None
-    cues: tuple[Cue, ...] = ()
+    cues: tuple[Cue, ...] = ()  # upward directions in the room, the one that defines the room's y first
 
 
 def find_room(poses: Poses, pictures: Mapping[str, Path], settings: CaptureConfig) -> Room:

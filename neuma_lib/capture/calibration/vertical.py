@@ -17,29 +17,20 @@ import numpy as np
 from neuma_lib.capture.pictures import QUARTER_TURNS
 from neuma_lib.errors import InputError
 
-UP = (0.0, 1.0, 0.0)
-"""Upward direction of the room."""
-MAX_ANGLE = 15.0
-"""Angle between two cues above which at least one of them is wrong [degrees]."""
-ROLL = 5.0
-"""Standard deviation of the roll of a hand-held camera [degrees]."""
+UP = (0.0, 1.0, 0.0)  # upward direction of the room
+MAX_ANGLE = 15.0  # angle between two cues above which at least one of them is wrong [degrees]
+ROLL = 5.0  # standard deviation of the roll of a hand-held camera [degrees]
 _DEVIATIONS = 2.0  # standard deviations by which an angle must exceed the limit
 _ROUNDS = 5  # of direction and quarter turns in turn
 
 
 @dataclass(frozen=True, eq=False)
 class Cue:
-    """An estimate of the upward direction.
+    """An estimate of the upward direction."""
 
-    Attributes:
-        name: its source, for messages.
-        up: unit vector (3,).
-        deviation: standard deviation about the worst axis [degrees].
-    """
-
-    name: str
-    up: np.ndarray
-    deviation: float = 0.0
+    name: str  # its source, for messages
+    up: np.ndarray  # unit vector (3,)
+    deviation: float = 0.0  # standard deviation about the worst axis [degrees]
 
     def angle(self, other: Cue) -> float:
         """Angle to another cue [degrees]."""

@@ -15,8 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-MIN_FRAMES = 5
-"""Frames of a track: a parabola passes through any three."""
+MIN_FRAMES = 5  # frames of a track: a parabola passes through any three
 _MIN_TRAVEL = 1.0  # path length of a track, in diameters: resting objects fit a parabola, too
 _MAX_CANDIDATES = 5  # per picture, the largest ones
 _TOLERANCE = 0.35  # distance from the track, in radii
@@ -29,21 +28,14 @@ _MAX_GAP = 2  # frames in which the object may be missed
 
 @dataclass(frozen=True, eq=False)
 class BallisticTrack:
-    """A segment of free flight.
+    """A segment of free flight."""
 
-    Attributes:
-        frames: numbers of its first and last frame.
-        candidates: frame -> number of the candidate on the track; frames in which it was missed are left out.
-        start: time origin of the coefficients [s].
-        coefficients: position = c0 + c1 t + c2 t^2, (3, 2) [px].
-        area: median area of the candidates [px].
-    """
-
-    frames: tuple[int, int]
+    frames: tuple[int, int]  # numbers of its first and last frame
+    # frame -> number of the candidate on the track; frames in which it was missed are left out
     candidates: dict[int, int]
-    start: float
-    coefficients: np.ndarray
-    area: float
+    start: float  # time origin of the coefficients [s]
+    coefficients: np.ndarray  # position = c0 + c1 t + c2 t^2, (3, 2) [px]
+    area: float  # median area of the candidates [px]
 
     def place(self, time: float | np.ndarray) -> np.ndarray:
         """Position (..., 2) [px] at a time [s]."""

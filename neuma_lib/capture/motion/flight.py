@@ -36,34 +36,22 @@ _MIN_SIDEWAYS = 0.05  # least velocity along the view, as share of the velocity
 
 @dataclass(frozen=True, eq=False)
 class Filmed:
-    """Undistorted frames of a take by one camera, those with a mask.
+    """Undistorted frames of a take by one camera, those with a mask."""
 
-    Attributes:
-        camera: its name.
-        numbers: of the frames, (T,).
-        times: on its clock [s], (T,).
-        pixels: T pictures, RGB or RGBA, (H, W, 3) or (H, W, 4), uint8.
-        masks: (T, H, W).
-        flight: numbers of the first and last frame of its first free flight. None without free flight.
-        viewmat, K: in the room, (4, 4) and (3, 3).
-        sensor_rows: rows of the recorded frames.
-        row_time: of a rolling shutter [s].
-        sound: mono, (N,). None if missing or not on the clock of the picture.
-        offset: set by the user [s]. None if it is to be estimated.
-    """
-
-    camera: str
-    numbers: np.ndarray
-    times: np.ndarray
-    pixels: Sequence[np.ndarray]
-    masks: np.ndarray
+    camera: str  # its name
+    numbers: np.ndarray  # of the frames, (T,)
+    times: np.ndarray  # on its clock [s], (T,)
+    pixels: Sequence[np.ndarray]  # T pictures, RGB or RGBA, (H, W, 3) or (H, W, 4), uint8
+    masks: np.ndarray  # (T, H, W)
+    # numbers of the first and last frame of its first free flight. None without free flight.
     flight: tuple[int, int] | None
+    # viewmat, K: in the room, (4, 4) and (3, 3)
     viewmat: np.ndarray
     K: np.ndarray
-    sensor_rows: int
-    row_time: float = 0.0
-    sound: np.ndarray | None = None
-    offset: float | None = None
+    sensor_rows: int  # rows of the recorded frames
+    row_time: float = 0.0  # of a rolling shutter [s]
+    sound: np.ndarray | None = None  # mono, (N,). None if missing or not on the clock of the picture.
+    offset: float | None = None  # set by the user [s]. None if it is to be estimated.
 
     @property
     def centroids(self) -> np.ndarray:
@@ -91,25 +79,16 @@ class Filmed:
 
 @dataclass(frozen=True, eq=False)
 class Flight:
-    """Free flight of a take.
+    """Free flight of a take."""
 
-    Attributes:
-        fall: in the room.
-        spin: None if the object has too little texture.
-        frames: numbers of the first and last frame of the fit, for each camera.
-        tracks: of the cameras, all frames.
-        offsets_from: source of the time offset of each camera but the first, as text.
-        agreement: IoU of each camera's mask at rest with the common body. None with one camera.
-        gravity: result of the gravity check, as text.
-    """
-
-    fall: FreeFall
-    spin: Spin | None
-    frames: list[tuple[int, int]]
-    tracks: list[Track]
-    offsets_from: list[str]
+    fall: FreeFall  # in the room
+    spin: Spin | None  # None if the object has too little texture
+    frames: list[tuple[int, int]]  # numbers of the first and last frame of the fit, for each camera
+    tracks: list[Track]  # of the cameras, all frames
+    offsets_from: list[str]  # source of the time offset of each camera but the first, as text
+    # IoU of each camera's mask at rest with the common body. None with one camera.
     agreement: np.ndarray | None
-    gravity: str
+    gravity: str  # result of the gravity check, as text
 
 
 def find_flight(views: Sequence[Filmed], name: str, metric: bool = True, cues: Sequence[Cue] = ()) -> Flight:

@@ -19,8 +19,7 @@ MAX_RMS_OF_RADIUS = 0.1
 """The same as share of the object's radius, since the centroid of a mask moves relative to the centre as the object
 turns. Different takes that fit so well are refused by the check of gravity."""
 TRIANGULATED, IN_PLANE = "triangulated", "one view in a plane"
-AT_CONTACT = "one view in the plane of contact"
-"""How the distance of a fall from the cameras is known."""
+AT_CONTACT = "one view in the plane of contact"  # how the distance of a fall from the cameras is known
 _ENDS = 0.2  # share of a track at either end that the first fit leaves out
 _MAX_DEVIATION = 4.0  # distance from the fit, in root mean squares of both coordinates
 _MAX_CORRELATION = 0.95  # of neighbouring frames
@@ -29,48 +28,32 @@ _MIN_RMS = 0.2  # [px], accuracy of masks
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """Undistorted positions of the object's centre in the pictures of one camera.
+    """Undistorted positions of the object's centre in the pictures of one camera."""
 
-    Attributes:
-        times: on the camera's clock [s], (T,).
-        places: (x, y) [px], pixel centres at +0.5, (T, 2).
-        viewmat: world to camera, OpenCV axes, (4, 4).
-        K: intrinsics [px], (3, 3).
-        name: of the video for messages.
-        radius: of a circle with the area of the object [px]. 0 if unknown.
-    """
-
-    times: np.ndarray
-    places: np.ndarray
-    viewmat: np.ndarray
-    K: np.ndarray
-    name: str
-    radius: float = 0.0
+    times: np.ndarray  # on the camera's clock [s], (T,)
+    places: np.ndarray  # (x, y) [px], pixel centres at +0.5, (T, 2)
+    viewmat: np.ndarray  # world to camera, OpenCV axes, (4, 4)
+    K: np.ndarray  # intrinsics [px], (3, 3)
+    name: str  # of the video for messages
+    radius: float = 0.0  # of a circle with the area of the object [px]. 0 if unknown.
 
 
 @dataclass(frozen=True, eq=False)
 class FreeFall:
-    """x(t) = x0 + v0 t + a t^2 / 2, with t relative to ``start`` on the clock of the first camera.
+    """x(t) = x0 + v0 t + a t^2 / 2, with t relative to ``start`` on the clock of the first camera."""
 
-    Attributes:
-        x0, v0, a: [m], [m/s], [m/s^2], (3,) each.
-        offsets: seconds to add to the times of each camera, the first 0, (cameras,).
-        covariance: of (x0, v0, a, offsets without the first), (8 + cameras,) squared, including the correlation of
-            consecutive residuals. 0 for fixed values.
-        start: [s].
-        rms: of the residuals [px].
-        views: `TRIANGULATED`, `AT_CONTACT` or `IN_PLANE`, where the plane is an assumption.
-        distance: relative standard deviation of all lengths by that of the plane. 0 if triangulated.
-    """
-
+    # x0, v0, a: [m], [m/s], [m/s^2], (3,) each
     x0: np.ndarray
     v0: np.ndarray
     a: np.ndarray
-    offsets: np.ndarray
+    offsets: np.ndarray  # seconds to add to the times of each camera, the first 0, (cameras,)
+    # of (x0, v0, a, offsets without the first), (8 + cameras,) squared, including the correlation of
+    # consecutive residuals. 0 for fixed values.
     covariance: np.ndarray
-    start: float
-    rms: float
-    views: str
+    start: float  # [s]
+    rms: float  # of the residuals [px]
+    views: str  # `TRIANGULATED`, `AT_CONTACT` or `IN_PLANE`, where the plane is an assumption
+    # relative standard deviation of all lengths by that of the plane. 0 if triangulated.
     distance: float = 0.0
 
     def place(self, times: np.ndarray) -> np.ndarray:

@@ -22,21 +22,13 @@ _UNDECIDED = f"more than {_MAX_MISMATCH:.0%} off, but within its uncertainty: re
 
 @dataclass(frozen=True, eq=False)
 class Gravity:
-    """The acceleration of a fall.
+    """The acceleration of a fall."""
 
-    Attributes:
-        a: [m/s^2], (3,).
-        covariance: (3, 3).
-        source: how it was measured, for messages.
-        several: whether it is from several cameras, which may show different takes.
-        measured: whether its size is measured. Otherwise a plane of the fall is assumed.
-    """
-
-    a: np.ndarray
-    covariance: np.ndarray
-    source: str
-    several: bool = True
-    measured: bool = True
+    a: np.ndarray  # [m/s^2], (3,)
+    covariance: np.ndarray  # (3, 3)
+    source: str  # how it was measured, for messages
+    several: bool = True  # whether it is from several cameras, which may show different takes
+    measured: bool = True  # whether its size is measured. Otherwise a plane of the fall is assumed.
 
     @property
     def ratio(self) -> tuple[float, float]:

@@ -22,8 +22,7 @@ from neuma_lib.capture.tools import opencv
 _MAX_FRAMES = 8  # frames over which a point is tracked before its neighbourhood rotates out of view
 _POINTS = 25  # points tracked from one frame
 _DEPTH_SPREAD = 0.4  # standard deviation of the depth of a surface from that of a sphere, in radii
-PIXEL_SPREAD = 0.3
-"""Standard deviation of a tracked point [px]."""
+PIXEL_SPREAD = 0.3  # standard deviation of a tracked point [px]
 _MIN_POINTS = 8
 _WINDOW = 15  # side of the window compared around a point [px]
 _MAX_RETURN_ERROR = 0.5  # after tracking forward and backward [px]
@@ -31,19 +30,12 @@ _MAX_RETURN_ERROR = 0.5  # after tracking forward and backward [px]
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """Track of a surface point in one camera.
+    """Track of a surface point in one camera."""
 
-    Attributes:
-        camera: its number in the list of tracks.
-        times: on that camera's clock [s], (T,).
-        places: undistorted [px], (T, 2).
-        radius: of a disc with the area of the mask, at the first time [px].
-    """
-
-    camera: int
-    times: np.ndarray
-    places: np.ndarray
-    radius: float
+    camera: int  # its number in the list of tracks
+    times: np.ndarray  # on that camera's clock [s], (T,)
+    places: np.ndarray  # undistorted [px], (T, 2)
+    radius: float  # of a disc with the area of the mask, at the first time [px]
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,14 +17,11 @@ from neuma_lib.errors import InputError
 from neuma_lib.io.files import existing, one_line
 from neuma_lib.io.processes import start_child
 
-RATE = 16_000
-"""Sampling rate of the compared sound [Hz]."""
-MAX_SOUND = 3600
-"""Maximum duration of the sound of a video [s]: 230 MB at `RATE`."""
+RATE = 16_000  # sampling rate of the compared sound [Hz]
+MAX_SOUND = 3600  # maximum duration of the sound of a video [s]: 230 MB at `RATE`
 SOUND_SECONDS = 4.0
 """Maximum time to read the sound of a small file [s]. A sampling rate of 100 MHz takes much longer."""
-SOUND_RATE = 500e3
-"""Bytes of a larger file that may take a second more."""
+SOUND_RATE = 500e3  # bytes of a larger file that may take a second more
 _BAND = (300.0, 6000.0)  # band of claps and impacts, above hum and below the filters of phones [Hz]
 SOUND_SPREAD = 0.005
 """Standard deviation of an offset due to the travel time of sound, 2.9 ms per metre, and delays in phones [s]."""

@@ -28,21 +28,13 @@ _GRAVITY_UNIT, _OFFSET_UNIT = 3.0, 0.01  # [m/s^2], [s]
 
 @dataclass(frozen=True, eq=False)
 class FittedPose:
-    """A pose with its nuisance parameters.
+    """A pose with its nuisance parameters."""
 
-    Attributes:
-        motion: of the body.
-        offsets: to the times of each camera [s], (cameras,).
-        enlargement: of the rendered body, relative.
-        gains: of the cameras, (cameras, 3).
-        cost: sum of squares in its stage.
-    """
-
-    motion: RigidMotion
-    offsets: np.ndarray
-    enlargement: float
-    gains: np.ndarray
-    cost: float = np.inf
+    motion: RigidMotion  # of the body
+    offsets: np.ndarray  # to the times of each camera [s], (cameras,)
+    enlargement: float  # of the rendered body, relative
+    gains: np.ndarray  # of the cameras, (cameras, 3)
+    cost: float = np.inf  # sum of squares in its stage
 
 
 class Problem:

@@ -19,42 +19,30 @@ _CLEAR_ANGLE = 10.0  # standard deviation of the rotation above which it is ambi
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """A photographed object placed into its video, x_video = s R x_photo + t at the time `start`.
+    """A photographed object placed into its video, x_video = s R x_photo + t at the time `start`."""
 
-    Attributes:
-        names: of the cameras.
-        start: time of the first frame of the flight in all cameras, by the clock of the first one [s].
-        pivot: centre of mass as photographed [m], (3,).
-        scale_known: whether photographs and video have the same scale, s = 1.
-        pose: pose and motion.
-        covariance: (15 + cameras,) squared, of rotation about the world axes [rad], centre [m], velocity
-            [m/s], spin [rad/s], enlargement, gravity [m/s^2] and offsets of all cameras but the first [s]; 0 for fixed
-            values such as gravity.
-        gravity, gravity_covariance: fitted gravity [m/s^2], (3,) and (3, 3).
-        before, after: agreement of the object in the orientation of the photographs, and as registered.
-        rival: cost of the next distinct pose relative to that of the best one, and the angle between them [degrees], or
-            None if no other pose is left.
-        spin_significant: whether the spin differs significantly from 0; it is 0 otherwise.
-        pictures: number of pictures in the last stage, and their side [px].
-        axes: rows are the first camera's right, down and viewing direction, (3, 3).
-        comparisons: pictures of each camera with their renders.
-    """
-
-    names: tuple[str, ...]
-    start: float
-    pivot: np.ndarray
-    scale_known: bool
-    pose: FittedPose
+    names: tuple[str, ...]  # of the cameras
+    start: float  # time of the first frame of the flight in all cameras, by the clock of the first one [s]
+    pivot: np.ndarray  # centre of mass as photographed [m], (3,)
+    scale_known: bool  # whether photographs and video have the same scale, s = 1
+    pose: FittedPose  # pose and motion
+    # (15 + cameras,) squared, of rotation about the world axes [rad], centre [m], velocity [m/s], spin
+    # [rad/s], enlargement, gravity [m/s^2] and offsets of all cameras but the first [s]; 0 for fixed values
+    # such as gravity
     covariance: np.ndarray
+    # gravity, gravity_covariance: fitted gravity [m/s^2], (3,) and (3, 3)
     gravity: np.ndarray
     gravity_covariance: np.ndarray
+    # before, after: agreement of the object in the orientation of the photographs, and as registered
     before: Agreement
     after: Agreement
+    # cost of the next distinct pose relative to that of the best one, and the angle between them [degrees],
+    # or None if no other pose is left
     rival: tuple[float, float] | None
-    spin_significant: bool
-    pictures: tuple[int, int]
-    axes: np.ndarray
-    comparisons: list[Comparison]
+    spin_significant: bool  # whether the spin differs significantly from 0; it is 0 otherwise
+    pictures: tuple[int, int]  # number of pictures in the last stage, and their side [px]
+    axes: np.ndarray  # rows are the first camera's right, down and viewing direction, (3, 3)
+    comparisons: list[Comparison]  # pictures of each camera with their renders
 
     @property
     def rotation(self) -> np.ndarray:

@@ -84,20 +84,14 @@ STAGES = (
 
 @dataclass(frozen=True, eq=False)
 class Parabola:
-    """Initial estimate of a flight.
+    """Initial estimate of a flight."""
 
-    Attributes:
-        time: of the other values, by the clock of the first camera [s].
-        place, velocity: of the mask centres [m], [m/s], (3,).
-        gravity: [m/s^2], (3,).
-        spin: [rad/s], (3,). None if unknown.
-    """
-
-    time: float
+    time: float  # of the other values, by the clock of the first camera [s]
+    # place, velocity: of the mask centres [m], [m/s], (3,)
     place: np.ndarray
     velocity: np.ndarray
-    gravity: np.ndarray
-    spin: np.ndarray | None = None
+    gravity: np.ndarray  # [m/s^2], (3,)
+    spin: np.ndarray | None = None  # [rad/s], (3,). None if unknown.
 
     def at(self, time: float) -> Parabola:
         """The same flight at another reference time."""

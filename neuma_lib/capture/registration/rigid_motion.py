@@ -7,28 +7,19 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-_MAX_ANGLE = 0.1
-"""Maximum rotation angle per integration step, whose error is of fifth order [rad]."""
+_MAX_ANGLE = 0.1  # maximum rotation angle per integration step, whose error is of fifth order [rad]
 
 
 @dataclass(frozen=True, eq=False)
 class RigidMotion:
-    """A free flight, x(t) = R(t) (x_photo - pivot) + c(t).
+    """A free flight, x(t) = R(t) (x_photo - pivot) + c(t)."""
 
-    Attributes:
-        rotation: R(0), from the photographed body to the world, (3, 3).
-        centre: c(0), centre of mass [m], (3,).
-        velocity: initial velocity of the centre [m/s], (3,).
-        spin: initial angular velocity in the world [rad/s], (3,).
-        gravity: gravity [m/s^2], (3,).
-        inertia: moment of inertia per mass of the photographed body about its centre of mass [m^2], (3, 3).
-    """
-
-    rotation: np.ndarray
-    centre: np.ndarray
-    velocity: np.ndarray
-    spin: np.ndarray
-    gravity: np.ndarray
+    rotation: np.ndarray  # R(0), from the photographed body to the world, (3, 3)
+    centre: np.ndarray  # c(0), centre of mass [m], (3,)
+    velocity: np.ndarray  # initial velocity of the centre [m/s], (3,)
+    spin: np.ndarray  # initial angular velocity in the world [rad/s], (3,)
+    gravity: np.ndarray  # gravity [m/s^2], (3,)
+    # moment of inertia per mass of the photographed body about its centre of mass [m^2], (3, 3)
     inertia: np.ndarray
 
     def place(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -30,37 +30,25 @@ LOCAL = 7
 """Unknowns of a picture: rotation of the body [rad] and shift [m], both in world axes, and enlargement."""
 SHADE_WEIGHT = 0.004
 """Squared residual over the body that is equivalent to a change of the shading factor by 1."""
-_MARGIN = 1.2
-"""Side of a crop, in diameters of the body."""
-_STEP = 0.3
-"""Half width of the differences [px]."""
-_MIN_COLOUR, _MIN_PIXELS = 0.04, 20
-"""Minimum colour of pixels for the gain, and their minimum number."""
-_LIKELY_TINT = 0.15
-"""Prior standard deviation of the logarithm of the tint of a camera."""
+_MARGIN = 1.2  # side of a crop, in diameters of the body
+_STEP = 0.3  # half width of the differences [px]
+_MIN_COLOUR, _MIN_PIXELS = 0.04, 20  # minimum colour of pixels for the gain, and their minimum number
+_LIKELY_TINT = 0.15  # prior standard deviation of the logarithm of the tint of a camera
 _BATCH_BYTES = 48e6
 
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """Frames of a flight by one camera.
+    """Frames of a flight by one camera."""
 
-    Attributes:
-        name: name of the camera.
-        times: times of the frames by its clock [s], (T,).
-        images: straight-alpha RGBA, uint8, (T, H, W, 4).
-        viewmat, K: world to camera, OpenCV axes, (4, 4); intrinsics [px], (3, 3).
-        offset: offset of its times to the clock of the first camera [s].
-        offset_known: whether the offset is exact.
-    """
-
-    name: str
-    times: np.ndarray
-    images: np.ndarray
+    name: str  # name of the camera
+    times: np.ndarray  # times of the frames by its clock [s], (T,)
+    images: np.ndarray  # straight-alpha RGBA, uint8, (T, H, W, 4)
+    # viewmat, K: world to camera, OpenCV axes, (4, 4); intrinsics [px], (3, 3)
     viewmat: np.ndarray
     K: np.ndarray
-    offset: float = 0.0
-    offset_known: bool = True
+    offset: float = 0.0  # offset of its times to the clock of the first camera [s]
+    offset_known: bool = True  # whether the offset is exact
 
     @property
     def clock(self) -> np.ndarray:
@@ -86,19 +74,12 @@ class Sight:
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """Gaussians relative to the centre of mass of their body.
+    """Gaussians relative to the centre of mass of their body."""
 
-    Attributes:
-        gaussians: with means relative to the centre [m].
-        covars: (G, 3, 3) [m^2].
-        sh: colours, (G, K, 3).
-        radius: 98th percentile of the distances of means from the centre [m].
-    """
-
-    gaussians: Gaussians
-    covars: Tensor
-    sh: Tensor
-    radius: float
+    gaussians: Gaussians  # with means relative to the centre [m]
+    covars: Tensor  # (G, 3, 3) [m^2]
+    sh: Tensor  # colours, (G, K, 3)
+    radius: float  # 98th percentile of the distances of means from the centre [m]
 
     @classmethod
     def about(cls, gaussians: Gaussians, centre: np.ndarray) -> Body:
@@ -111,19 +92,12 @@ class Body:
 
 @dataclass(frozen=True, eq=False)
 class Agreement:
-    """Agreement of a pose with the images, each of shape (pictures,).
+    """Agreement of a pose with the images, each of shape (pictures,)."""
 
-    Attributes:
-        camera: index of the camera.
-        iou: IoU of mask and rendered silhouette.
-        off: distance of their centroids [px of the video].
-        rms: root mean square residual of colours and coverage over the mask.
-    """
-
-    camera: np.ndarray
-    iou: np.ndarray
-    off: np.ndarray
-    rms: np.ndarray
+    camera: np.ndarray  # index of the camera
+    iou: np.ndarray  # IoU of mask and rendered silhouette
+    off: np.ndarray  # distance of their centroids [px of the video]
+    rms: np.ndarray  # root mean square residual of colours and coverage over the mask
 
     def by_camera(self, names: Sequence[str]) -> dict[str, dict[str, float]]:
         """JSON values by name of the camera."""

@@ -23,8 +23,7 @@ _MAX_JUMP = 0.1  # relative change of a good mask's area from frame to frame of 
 _MIN_OVERLAP = 0.9  # IoU of masks from videos with those of the placed object, in free flight
 MAX_TURN = 5.0
 """Standard deviation of the object's orientation about its worst axis, for good videos [degrees]."""
-MIN_PSNR = 20.0
-"""PSNR inside the object of Gaussians in held-out photographs, for good photographs [dB]."""
+MIN_PSNR = 20.0  # PSNR inside the object of Gaussians in held-out photographs, for good photographs [dB]
 
 
 class Check(NamedTuple):

@@ -3,8 +3,6 @@
 The same function colours mesh vertices, sand grains and the surface of a liquid (through the particles below it).
 """
 
-from __future__ import annotations
-
 import numpy as np
 import trimesh
 
@@ -12,8 +10,7 @@ from neuma_lib.config.blender import AppearanceConfig
 from neuma_lib.errors import InputError
 from neuma_lib.geometry import shapes
 
-BORDER = 0.008
-"""Width of the borders between parts [m]."""
+BORDER = 0.008  # width of the borders between parts [m]
 
 
 def parse_color(text: str) -> np.ndarray:

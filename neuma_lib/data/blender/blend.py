@@ -1,7 +1,5 @@
 """A moving surface as a .blend file, written by a separate Blender process."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,8 +13,7 @@ from neuma_lib.io.gltf import linear
 from neuma_lib.splatting.viewpoints import video_views
 
 _WORKER = "neuma_lib.data.blender.cycles_animation"
-_SIZE, _SAMPLES = (256, 256), 16
-"""Size of the preview [px], and samples per pixel."""
+_SIZE, _SAMPLES = (256, 256), 16  # size of the preview [px], and samples per pixel
 
 
 def write_blend(

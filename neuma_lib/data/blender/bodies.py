@@ -1,7 +1,5 @@
 """Rendered geometry of simulated particles: the mesh of a solid, grains of sand, or the surface of a liquid."""
 
-from __future__ import annotations
-
 import numpy as np
 import trimesh
 from scipy.spatial import cKDTree

@@ -12,12 +12,9 @@ from mathutils import Matrix, Vector
 from neuma_lib.errors import InputError
 
 SENSOR = 36.0  # width of the camera's sensor [mm]; only its ratio to the focal length matters
-SEED = 0
-"""Seed of the sampler, for deterministic images."""
-AMBIENT = 0.82
-"""Radiance of the uniform surroundings, independent of the surface's orientation."""
-KEY = 0.35
-"""Strength of a wide soft light above the frontal camera, for shading."""
+SEED = 0  # seed of the sampler, for deterministic images
+AMBIENT = 0.82  # radiance of the uniform surroundings, independent of the surface's orientation
+KEY = 0.35  # strength of a wide soft light above the frontal camera, for shading
 
 
 def start(width: int, height: int, samples: int, threads: int, device: str = "cpu") -> None:

@@ -3,8 +3,6 @@
 The surface has one shape key per frame and an animated evaluation time.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 
@@ -14,8 +12,7 @@ from mathutils import Matrix
 
 from neuma_lib.data.blender import cycles
 
-RATE = 24
-"""Blender's frames per second."""
+RATE = 24  # Blender's frames per second
 
 
 def main(path: str) -> None:

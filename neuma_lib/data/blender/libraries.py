@@ -1,7 +1,5 @@
 """Explanation of missing libraries of Blender's Python module."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

@@ -5,8 +5,6 @@ the target folder when all are rendered. The object is a `Surface` (moving mesh 
 `Liquid` (a separate surface per frame).
 """
 
-from __future__ import annotations
-
 import io
 import os
 import re
@@ -17,6 +15,7 @@ import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -31,25 +30,17 @@ from neuma_lib.io.processes import start_child
 from neuma_lib.splatting.viewpoints import Views
 
 Progress = Callable[[int, int], None]
-OTHER_PYTHON = "NEUMA_BLENDER_PYTHON"
-"""Environment variable with another interpreter that has bpy."""
+OTHER_PYTHON = "NEUMA_BLENDER_PYTHON"  # environment variable with another interpreter that has bpy
 
 
 @dataclass(frozen=True)
 class Surface:
-    """A mesh with moving vertices, or moving balls of one size.
+    """A mesh with moving vertices, or moving balls of one size."""
 
-    Attributes:
-        vertices: positions [m], shape (T, n, 3); centres for balls.
-        faces: vertex indices, shape (m, 3); empty for balls.
-        colors: sRGB colours of the vertices in [0, 1], shape (n, 3).
-        radius: of the balls [m]; 0 for a mesh.
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    colors: np.ndarray
-    radius: float = 0.0
+    vertices: np.ndarray  # positions [m], shape (T, n, 3); centres for balls
+    faces: np.ndarray  # vertex indices, shape (m, 3); empty for balls
+    colors: np.ndarray  # sRGB colours of the vertices in [0, 1], shape (n, 3)
+    radius: float = 0.0  # of the balls [m]; 0 for a mesh
 
     def __len__(self) -> int:
         return len(self.vertices)
@@ -123,8 +114,7 @@ class Several:
         return {"bodies": np.array(len(self.bodies)), **named}
 
 
-LABELS = "labels"
-"""Folder of the label images, in that of the images."""
+LABELS = "labels"  # folder of the label images, in that of the images
 
 
 def render_images(
@@ -145,10 +135,8 @@ def render_images(
     Args:
         geometry: the object, or several, frames 0 ... len - 1. With several and ``matte``, images of the same names in
             the folder `LABELS` have the number of the visible object, from 1, or 0 where they cover less than half.
-        views: cameras.
         shots: (frame, camera) of each image; shots of one frame should be consecutive.
         out_dir: folder of the images, created if missing; existing images are replaced.
-        names: file name of each shot.
         samples: samples per pixel, denoised (except alpha: 8 are usable, 16 clean).
         threads: CPU cores for Blender.
         progress: called with the numbers of finished and of all images.
@@ -272,21 +260,15 @@ def run_worker(module: str, job: Path, total: int = 0, progress: Progress | None
 
 
 def render_static(
-    geometry: Surface | Liquid | Several,
-    views: Views,
-    out_dir: str | Path,
-    samples: int,
-    threads: int = 1,
-    progress: Progress | None = None,
-    device: str = "cpu",
-    obstacles: Sequence[Obstacle] = (),
+    geometry: Surface | Liquid | Several, views: Views, out_dir: str | Path, samples: int, **options: Any
 ) -> None:
-    """Render frame 0 from every camera to ``s_<view>.png``, and write transforms.json of those that see the object."""
+    """Render frame 0 from every camera to ``s_<view>.png``, and write transforms.json of those that see the object.
+
+    ``options`` are those of `render_images`.
+    """
     shots = [(0, view) for view in range(len(views))]
     names = [f"s_{view:03d}.png" for _, view in shots]
-    _render_set(
-        geometry, views, shots, names, [0], [0.0], out_dir, obstacles, samples, threads, progress, device
-    )
+    _render_set(geometry, views, shots, names, [0], [0.0], out_dir, samples, **options)
 
 
 def render_dynamic(
@@ -296,10 +278,7 @@ def render_dynamic(
     dt: float,
     out_dir: str | Path,
     samples: int,
-    threads: int = 1,
-    progress: Progress | None = None,
-    device: str = "cpu",
-    obstacles: Sequence[Obstacle] = (),
+    **options: Any,
 ) -> None:
     """Render every frame from every camera to ``d_<view>_<step>.png``, and write transforms.json.
 
@@ -308,22 +287,23 @@ def render_dynamic(
     Args:
         steps: simulation step of each frame of ``geometry``.
         dt: time step [s].
+        options: those of `render_images`.
     """
     if len(steps) != len(geometry):
         raise InputError("steps", f"there are {len(steps)} steps for {len(geometry)} frames of geometry")
     shots = [(frame, view) for frame in range(len(geometry)) for view in range(len(views))]
     names = [f"d_{view}_{steps[frame]:04d}.png" for frame, view in shots]
     times = [float(step) * dt for step in steps]
-    _render_set(
-        geometry, views, shots, names, steps, times, out_dir, obstacles, samples, threads, progress, device
-    )
+    _render_set(geometry, views, shots, names, steps, times, out_dir, samples, **options)
 
 
-def _render_set(geometry, views, shots, names, steps, times, out_dir, obstacles, *options) -> None:
+def _render_set(geometry, views, shots, names, steps, times, out_dir, samples, **options) -> None:
     transforms = Path(out_dir, "transforms.json")
     transforms.unlink(missing_ok=True)  # marks the folder as unfinished
-    render_images(geometry, views, shots, out_dir, names, *options, obstacles=obstacles)
-    masks = (np.asarray(Image.open(Path(out_dir, name)))[..., 3] for name in names if obstacles)
+    render_images(geometry, views, shots, out_dir, names, samples, **options)
+    masks = (
+        np.asarray(Image.open(Path(out_dir, name)))[..., 3] for name in names if options.get("obstacles")
+    )
     visible = [bool((mask > 127).any()) for mask in masks] or [True] * len(names)
     if not any(visible):
         raise InputError("colliders", "hide the body in all images", "Move them, or give the scene images")

@@ -3,8 +3,6 @@
 Prints the number of finished images on standard output, one line per image. Output of Blender goes to standard error.
 """
 
-from __future__ import annotations
-
 import fcntl
 import os
 import platform

@@ -1,7 +1,5 @@
 """Pictures for figures: video frames, magnified renders, particles, and crops."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
@@ -20,16 +18,11 @@ from neuma_lib.splatting.extent import outermost
 from neuma_lib.splatting.observation import Observation
 from neuma_lib.splatting.viewpoints import video_views
 
-DENSITY = 1000.0
-"""Density of bodies whose pictures do not depend on it [kg/m^3]."""
-_WHITE = 250
-"""Minimum value of a background colour."""
-_FLATTEST, _TALLEST = 0.6, 1.5
-"""Limits of a picture's height relative to its width."""
-_BATCH = 4
-"""Number of frames rendered at a time."""
-_UNIT_BALL_RADIUS = 0.62
-"""Radius of the ball of volume 1: (3 / (4 pi))^(1/3)."""
+DENSITY = 1000.0  # density of bodies whose pictures do not depend on it [kg/m^3]
+_WHITE = 250  # minimum value of a background colour
+_FLATTEST, _TALLEST = 0.6, 1.5  # limits of a picture's height relative to its width
+_BATCH = 4  # number of frames rendered at a time
+_UNIT_BALL_RADIUS = 0.62  # radius of the ball of volume 1: (3 / (4 pi))^(1/3)
 
 
 def magnified(cameras: Cameras, factor: int) -> Cameras:

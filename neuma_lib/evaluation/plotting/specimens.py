@@ -1,7 +1,5 @@
 """Released bodies: records of markers next to the motion of the fitted law, and silhouettes that are predicted."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

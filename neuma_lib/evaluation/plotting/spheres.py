@@ -1,15 +1,11 @@
 """Render particles as shaded spheres, for figures."""
 
-from __future__ import annotations
-
 import numpy as np
 
 _LIGHT = np.array([-0.45, -0.75, -0.5]) / np.linalg.norm([-0.45, -0.75, -0.5])
 """Direction towards the light in camera axes (x right, y down, z forward): from above, left, behind the camera."""
-_AMBIENT = 0.45
-"""Brightness of a side without light."""
-_SUPERSAMPLING = 2
-"""Samples of a pixel along each axis."""
+_AMBIENT = 0.45  # brightness of a side without light
+_SUPERSAMPLING = 2  # samples of a pixel along each axis
 
 
 def draw_spheres(

@@ -5,8 +5,6 @@ Widths are those of a two-column page. Fonts have 7 points in print, at least 6.
 in black and white.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
@@ -18,19 +16,15 @@ from matplotlib.figure import Figure
 
 from neuma_lib.io.files import atomic
 
-COLUMN, PAGE = 3.3, 6.9
-"""Widths of a column and of a page [in]."""
-DPI = 300
-"""Resolution of the PNG files and of pictures inside PDF files."""
+COLUMN, PAGE = 3.3, 6.9  # widths of a column and of a page [in]
+DPI = 300  # resolution of the PNG files and of pictures inside PDF files
 
 BLACK, GREY, LIGHT = "#000000", "#7f7f7f", "#e6e6e6"
 ORANGE, SKY, GREEN, YELLOW, BLUE, VERMILION, PURPLE = (
     "#E69F00", "#56B4E9", "#009E73", "#F0E442", "#0072B2", "#D55E00", "#CC79A7",
 )  # fmt: skip
-SEQUENCE = (BLUE, ORANGE, GREEN, PURPLE, VERMILION, SKY)
-"""Colours of lines that are not methods, in order."""
-RAMP = "cividis"
-"""Colour map of ordered quantities, uniform in lightness and suited to colour-blind readers."""
+SEQUENCE = (BLUE, ORANGE, GREEN, PURPLE, VERMILION, SKY)  # colours of lines that are not methods, in order
+RAMP = "cividis"  # colour map of ordered quantities, uniform in lightness and suited to colour-blind readers
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,6 @@ spring_gaus    ``camera.json``, a folder each camera  as pac_nerf
 =============  =====================================  ====================================================
 """
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -33,8 +31,7 @@ from neuma_lib.io.images import image_file, read_image_set, read_transforms, wri
 from neuma_lib.io.positions import write_points
 
 PARTS = ("static", "dynamic")
-TRUTH = "truth"
-"""Folder of what a method must not read."""
+TRUTH = "truth"  # folder of what a method must not read
 MOTION = ("tracers", "tracers_again", "frames", "time")
 LICENSE = """\
 The images, cameras and motions in this folder were generated with the software "NeuMA, done right" and are licensed
@@ -46,20 +43,13 @@ warranty. The licence of the software is MIT.
 
 @dataclass(frozen=True, eq=False)
 class _Picture:
-    """An image of a scene.
+    """An image of a scene."""
 
-    Attributes:
-        file: to copy.
-        pixels: straight-alpha RGBA, uint8, shape (H, W, 4).
-        pose: camera to world, OpenGL axes, 4 x 4.
-        intrinsics: [px], 3 x 3.
-        view, step: numbers of the camera and of the simulation step.
-    """
-
-    file: Path
-    pixels: np.ndarray
-    pose: list[list[float]]
-    intrinsics: list[list[float]]
+    file: Path  # to copy
+    pixels: np.ndarray  # straight-alpha RGBA, uint8, shape (H, W, 4)
+    pose: list[list[float]]  # camera to world, OpenGL axes, 4 x 4
+    intrinsics: list[list[float]]  # [px], 3 x 3
+    # view, step: numbers of the camera and of the simulation step
     view: int
     step: int
 

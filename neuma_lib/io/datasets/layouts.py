@@ -10,8 +10,6 @@ OpenGL axes, y is up. Positions x of their world become ``scale x + offset`` in 
   each camera a folder of that name with RGBA images ``000.png``, ``001.png``, ...
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -35,14 +33,11 @@ from neuma_lib.io.images import (
 
 OFFSETS = {"all_data.json": (0.5, 0.0, 0.5), "camera.json": (0.0, -0.3, 0.0)}
 """List of a layout -> default offset of its world [m]: its ground at y = 0, its centre at that of the unit box."""
-BACKGROUND, OCCLUDER = -1, -2
-"""Frame numbers of PAC-NeRF's background images and occluder masks."""
-OCCLUDED = 50
-"""Minimum alpha of an occluder [1/255], as in the authors' code."""
+BACKGROUND, OCCLUDER = -1, -2  # frame numbers of PAC-NeRF's background images and occluder masks
+OCCLUDED = 50  # minimum alpha of an occluder [1/255], as in the authors' code
 BACKGROUND_DIFFERENCE = 24
 """Without a mask, the object is where a channel differs from the background by more than this [1/255]."""
-BOX_MARGIN = 0.1
-"""Allowed distance from the unit box of the point where all optical axes meet [m]."""
+BOX_MARGIN = 0.1  # allowed distance from the unit box of the point where all optical axes meet [m]
 _NAME = re.compile(r"[a-z]+_(\d{1,9})_(-?\d{1,9})", re.IGNORECASE)
 
 Frames = dict[tuple[int, int], dict[str, Any]]

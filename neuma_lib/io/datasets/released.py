@@ -5,8 +5,6 @@ images named ``<letter>_<view>_<step>.png``. This module converts them to our tr
 reads both.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,8 +14,7 @@ import numpy as np
 
 from neuma_lib.errors import InputError
 
-MAX_POSITION = 1e6
-"""Maximum coordinate of a camera [m]."""
+MAX_POSITION = 1e6  # maximum coordinate of a camera [m]
 _NAME = re.compile(r"[a-z]+_(\d{1,9})_(\d{1,9})$", re.IGNORECASE)
 
 

@@ -10,8 +10,6 @@ body, 0 background, others unknown. They are pictures of the second camera of ``
 ``colour_to_depth_rotation`` and ``colour_to_depth_translation_m``.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -29,22 +27,15 @@ _CORNERS = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5,
 
 @dataclass(frozen=True, eq=False)
 class Still:
-    """A photograph of a body at rest.
+    """A photograph of a body at rest."""
 
-    Attributes:
-        mask: of the body, shape (H, W).
-        K: intrinsics, pixel centres at half integers, shape (3, 3) [px].
-        marker: corners in the marker's frame, x right, y up, z towards the viewer, shape (M, 3) [m].
-        marker_pixels: shape (M, 2) [px].
-        camera: from the frame of the first camera of the record to that of this one, shape (4, 4).
-        unknown: pixels that may show the body, shape (H, W). None: there are none.
-    """
-
-    mask: NDArray[np.bool_]
-    K: Array
-    marker: Array
-    marker_pixels: Array
+    mask: NDArray[np.bool_]  # of the body, shape (H, W)
+    K: Array  # intrinsics, pixel centres at half integers, shape (3, 3) [px]
+    marker: Array  # corners in the marker's frame, x right, y up, z towards the viewer, shape (M, 3) [m]
+    marker_pixels: Array  # shape (M, 2) [px]
+    # from the frame of the first camera of the record to that of this one, shape (4, 4)
     camera: Array = field(default_factory=lambda: np.eye(4))
+    # pixels that may show the body, shape (H, W). None: there are none.
     unknown: NDArray[np.bool_] | None = None
 
 
@@ -64,11 +55,7 @@ def still_files(root: str | Path, record: str, key: str) -> list[str]:
 
 
 def read_stills(root: str | Path, record: str) -> list[Still]:
-    """All photographs of a record.
-
-    Raises:
-        InputError: a file is missing or damaged, or there is no such record.
-    """
+    """All photographs of a record. Raises InputError: a file is missing or damaged, or there is no such record."""
     masks = still_files(root, record, "mask")
     K = _intrinsics(root, "colour")
     path = Path(root, "calibration.json")
@@ -84,11 +71,7 @@ def read_stills(root: str | Path, record: str) -> list[Still]:
 
 
 def swing_files(root: str | Path, folder: str) -> dict[float, str]:
-    """Label maps of a swing, by their times [s].
-
-    Raises:
-        InputError: the folder has no times.
-    """
+    """Label maps of a swing, by their times [s]. Raises InputError: the folder has no times."""
     path = Path(root, folder, "times.json")
     with reading(path, "times of the label maps of a swing"):
         times = read_json(existing(path, "Give the folder of the records as stills.root"))["figures"]
@@ -96,11 +79,7 @@ def swing_files(root: str | Path, folder: str) -> dict[float, str]:
 
 
 def read_swing(root: str | Path, folder: str) -> dict[float, Still]:
-    """Silhouettes of a swing by their times [s], without markers.
-
-    Raises:
-        InputError: a file is missing or damaged.
-    """
+    """Silhouettes of a swing by their times [s], without markers. Raises InputError: a file is missing or damaged."""
     K, path, camera = _intrinsics(root, "depth"), Path(root, "calibration.json"), np.eye(4)
     with reading(path, "the pose of the second camera"):
         values = read_json(path)

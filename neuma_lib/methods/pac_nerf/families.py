@@ -4,8 +4,6 @@ As in the authors' code, moduli, yield stress and viscosity are stored as log10,
 nu = 0.45 tanh(x / 0.45), and the friction angle in degrees.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -19,10 +17,8 @@ from neuma_lib.mechanics.catalogue import lame
 from neuma_lib.mechanics.law import Law
 from neuma_lib.methods.pac_nerf.options import MODULI, PacFamilyConfig, PacNerfConfig
 
-MAX_POISSON = 0.45
-"""Bound on Poisson's ratio (PAC-NeRF)."""
-ANGLES = (0.5, 85.0)
-"""Bounds on the friction angle [degrees], which the authors' code does not have."""
+MAX_POISSON = 0.45  # bound on Poisson's ratio (PAC-NeRF)
+ANGLES = (0.5, 85.0)  # bounds on the friction angle [degrees], which the authors' code does not have
 
 
 class FamilyConstants(torch.nn.Module):

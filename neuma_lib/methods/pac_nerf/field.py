@@ -28,8 +28,7 @@ from neuma_lib.splatting.cameras import Cameras
 OCCUPIED = 1e-7
 """Refinement keeps the nodes with at least this share of the largest opacity and their neighbours (an absolute opacity
 in PAC-NeRF)."""
-STIFFNESS_POWER = 3
-"""Stiffness scales with this power of the opacity of a particle (PAC-NeRF's code)."""
+STIFFNESS_POWER = 3  # stiffness scales with this power of the opacity of a particle (PAC-NeRF's code)
 MAX_NODES = 20_000_000
 """Nodes of a lattice, of 52 bytes each, three times as many with those of the optimiser."""
 WHITE = (1.0, 1.0, 1.0)
@@ -37,21 +36,13 @@ WHITE = (1.0, 1.0, 1.0)
 
 @dataclass(frozen=True)
 class FieldParticles:
-    """Particles of a field for a simulation.
+    """Particles of a field for a simulation."""
 
-    Attributes:
-        x: positions [m], (N, 3).
-        features: raw density and colour features, (N, 1 + C).
-        opacities: opacities over one interval, (N,), which scale mass and stiffness.
-        volume: volume of space per particle [m^3].
-        voxel: voxel of the lattice that renders them [m].
-    """
-
-    x: Tensor
-    features: Tensor
-    opacities: Tensor
-    volume: float
-    voxel: float
+    x: Tensor  # positions [m], (N, 3)
+    features: Tensor  # raw density and colour features, (N, 1 + C)
+    opacities: Tensor  # opacities over one interval, (N,), which scale mass and stiffness
+    volume: float  # volume of space per particle [m^3]
+    voxel: float  # voxel of the lattice that renders them [m]
 
     def masses(self, density: float) -> Tensor:
         """alpha rho V [kg], (N,), for a body of density rho [kg/m^3]."""

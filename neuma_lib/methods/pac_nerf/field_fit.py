@@ -5,8 +5,6 @@ nodes before rendering, so that it is trained for this round trip. At given iter
 is restricted to occupied nodes, and Adam restarts.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,34 +23,24 @@ from neuma_lib.methods.pac_nerf.rendering import Opacity, camera_rays
 from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.observation import over_white
 
-VOLUME_RANGE = (1e-4, 1e-1)
-"""Range of opacities in the volume term (PAC-NeRF)."""
-CERTAIN = 1e-5
-"""Minimum distance of transmittances from 0 and 1 in their entropy (PAC-NeRF)."""
+VOLUME_RANGE = (1e-4, 1e-1)  # range of opacities in the volume term (PAC-NeRF)
+CERTAIN = 1e-5  # minimum distance of transmittances from 0 and 1 in their entropy (PAC-NeRF)
 
 
 @dataclass
 class RadianceReport:
-    """Report of a fit.
+    """Report of a fit."""
 
-    Attributes:
-        losses: training loss of every iteration.
-        voxel: voxel of the last lattice [m].
-        nodes: nodes of the last lattice along each axis.
-        particles: number of particles of the final field.
-        held_out: indices of the held-out views.
-        psnr, psnr_object: mean PSNR [dB] of the held-out views rendered with particles, full frame over white and
-            inside the object (pixels with alpha above 1/2).
-        direct_psnr, direct_psnr_object: the same without particles.
-    """
-
-    losses: list[float]
-    voxel: float
-    nodes: tuple[int, int, int]
-    particles: int
-    held_out: list[int]
+    losses: list[float]  # training loss of every iteration
+    voxel: float  # voxel of the last lattice [m]
+    nodes: tuple[int, int, int]  # nodes of the last lattice along each axis
+    particles: int  # number of particles of the final field
+    held_out: list[int]  # indices of the held-out views
+    # psnr, psnr_object: mean PSNR [dB] of the held-out views rendered with particles, full frame over white
+    # and inside the object (pixels with alpha above 1/2)
     psnr: float
     psnr_object: float
+    # direct_psnr, direct_psnr_object: the same without particles
     direct_psnr: float
     direct_psnr_object: float
 
@@ -70,7 +58,6 @@ def fit_radiance_field(
     Args:
         images: RGBA (V, H, W, 4) with straight alpha in [0, 1].
         cameras: their V cameras, more than half of `settings.held_out`.
-        settings: hyper-parameters.
         seed: random seed; the same seed gives the same field on a CPU.
         checkpoint: file for the state, so that an interrupted fit can resume; None for none.
         progress: called with (iteration, loss) after each iteration.

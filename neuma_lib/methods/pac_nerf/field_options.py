@@ -1,6 +1,6 @@
 """Settings of PAC-NeRF's first stage: a voxel radiance field from the views at t = 0."""
 
-from __future__ import annotations
+from typing import Self
 
 from pydantic import Field, model_validator
 
@@ -59,7 +59,7 @@ class RadianceConfig(Section):
     checkpoint_every: int = internal(100, "iterations between checkpoints", ge=1)
 
     @model_validator(mode="after")
-    def _ascending(self) -> RadianceConfig:
+    def _ascending(self) -> Self:
         if list(self.halvings) != sorted(set(self.halvings)) or not all(0 < f < 1 for f in self.halvings):
             raise ValueError("halvings: give ascending fractions between 0 and 1")
         return self

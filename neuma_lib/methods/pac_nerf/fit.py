@@ -6,8 +6,6 @@ all. Every image is simulated, transferred to a lattice and rendered along rays,
 The constants and their parametrisation are in `families`.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -28,14 +26,12 @@ from neuma_lib.sim.model import COURANT_LIMIT, MPM
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.splatting.observation import Observation
 
-MAX_HALVINGS = 4
-"""Maximum number of halvings of the time step."""
+MAX_HALVINGS = 4  # maximum number of halvings of the time step
 MIN_STEP = 1e-3
 """L-BFGS ends if a step changes every component of the velocity by at most this [m/s] (PAC-NeRF)."""
 MIN_GAIN = 1e-6
 """Share of the first loss by which a step of L-BFGS must lower the loss, tied to `MIN_STEP` in torch."""
-HISTORY = 20
-"""History size of L-BFGS (PAC-NeRF)."""
+HISTORY = 20  # history size of L-BFGS (PAC-NeRF)
 
 
 class Video:
@@ -93,38 +89,23 @@ class Video:
 
 @dataclass
 class PacNerfHistory:
-    """Training curves with one entry per Adam step, before the step.
+    """Training curves with one entry per Adam step, before the step."""
 
-    Attributes:
-        loss: loss of the frames, views and pixels of the step.
-        constants: fitted constants by name.
-        halvings: halvings of the time step.
-        seconds: wall time [s].
-    """
-
-    loss: list[float] = field(default_factory=list)
-    constants: dict[str, list[float]] = field(default_factory=dict)
-    halvings: list[int] = field(default_factory=list)
-    seconds: list[float] = field(default_factory=list)
+    loss: list[float] = field(default_factory=list)  # loss of the frames, views and pixels of the step
+    constants: dict[str, list[float]] = field(default_factory=dict)  # fitted constants by name
+    halvings: list[int] = field(default_factory=list)  # halvings of the time step
+    seconds: list[float] = field(default_factory=list)  # wall time [s]
 
 
 @dataclass
 class PacNerfFit:
-    """Result of `fit_pac_nerf`.
+    """Result of `fit_pac_nerf`."""
 
-    Attributes:
-        velocity: velocity of all particles [m/s], shape (3,).
-        velocity_losses: loss of every evaluation of L-BFGS.
-        constants: constants of the law.
-        history: training curves of the constants.
-        particles: numbers of simulated and of rendered particles.
-    """
-
-    velocity: Tensor
-    velocity_losses: list[float]
-    constants: FamilyConstants
-    history: PacNerfHistory
-    particles: tuple[int, int]
+    velocity: Tensor  # velocity of all particles [m/s], shape (3,)
+    velocity_losses: list[float]  # loss of every evaluation of L-BFGS
+    constants: FamilyConstants  # constants of the law
+    history: PacNerfHistory  # training curves of the constants
+    particles: tuple[int, int]  # numbers of simulated and of rendered particles
 
     def summary(self) -> str:
         """Summary line for the log."""
@@ -160,11 +141,9 @@ def fit_pac_nerf(
         observation: the video with the views to use.
         contact: step of the last frame before contact.
         constants: initial constants of the law, fitted in place.
-        settings: hyper-parameters.
         seed: seed of the random views and pixels.
         checkpoint: file for the state, so that an interrupted fit can resume; None for none.
         progress: called with (step, steps, loss).
-        log: receives messages.
 
     Raises:
         InputError: no frame before or after contact, or initial constants too stiff for the shortest time step.

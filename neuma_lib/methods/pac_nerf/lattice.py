@@ -13,23 +13,16 @@ from neuma_lib.errors import InputError
 
 EMPTY = -100.0
 """Value of all channels at a node without particles, which as raw density has no opacity (PAC-NeRF)."""
-MIN_WEIGHT = 1e-10
-"""Sum of weights up to which a node is empty (PAC-NeRF)."""
+MIN_WEIGHT = 1e-10  # sum of weights up to which a node is empty (PAC-NeRF)
 
 
 @dataclass(frozen=True)
 class Lattice:
-    """A regular lattice of nodes, the corners of voxels.
+    """A regular lattice of nodes, the corners of voxels."""
 
-    Attributes:
-        origin: position of node (0, 0, 0) [m].
-        voxel: distance between neighbouring nodes [m].
-        nodes: number of nodes along each axis, at least two.
-    """
-
-    origin: tuple[float, float, float]
-    voxel: float
-    nodes: tuple[int, int, int]
+    origin: tuple[float, float, float]  # position of node (0, 0, 0) [m]
+    voxel: float  # distance between neighbouring nodes [m]
+    nodes: tuple[int, int, int]  # number of nodes along each axis, at least two
 
     def __post_init__(self):
         if self.voxel <= 0 or min(self.nodes) < 2:
@@ -71,7 +64,6 @@ def interpolate(lattice: Lattice, values: Tensor, points: Tensor) -> Tensor:
     """Interpolated values (M, C), differentiable with respect to those of the nodes, not to the points.
 
     Args:
-        lattice: positions of the nodes.
         values: values at the nodes (X, Y, Z, C).
         points: positions (M, 3) [m], with linear extrapolation outside the lattice.
 

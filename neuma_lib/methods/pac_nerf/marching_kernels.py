@@ -1,6 +1,5 @@
 """Kernels of :mod:`neuma_lib.methods.pac_nerf.rendering`: selection of the points of a ray, and compositing."""
 
-# No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
 import functools
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """PAC-NeRF (Li et al., ICLR 2023): a radiance field, the initial velocity, and the constants of a given law."""
 
-from __future__ import annotations
-
 from neuma_lib.config.motion import MotionOptions
 from neuma_lib.errors import InputError
 from neuma_lib.methods.base import Case, Files, Method, Preset

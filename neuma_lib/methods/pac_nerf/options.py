@@ -1,18 +1,14 @@
 """Settings of PAC-NeRF's later stages: velocity, and constants of a named family of laws."""
 
-from __future__ import annotations
-
-from typing import Literal
+from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
 from neuma_lib.config.base import Section, internal
 from neuma_lib.config.laws import LawConfig
 
-MODULI = ("mu", "kappa")
-"""Shear and bulk modulus [Pa], which a family may be fitted in instead of E and nu."""
-FITTED = ("E", "nu", *MODULI, "yield_stress", "viscosity", "friction_angle")
-"""Constants that can be fitted."""
+MODULI = ("mu", "kappa")  # shear and bulk modulus [Pa], which a family may be fitted in instead of E and nu
+FITTED = ("E", "nu", *MODULI, "yield_stress", "viscosity", "friction_angle")  # constants that can be fitted
 
 
 class PacFamilyConfig(LawConfig):
@@ -23,7 +19,7 @@ class PacFamilyConfig(LawConfig):
     )
 
     @model_validator(mode="after")
-    def _fits_its_law(self) -> PacFamilyConfig:
+    def _fits_its_law(self) -> Self:
         known = {**self.elasticity.model_extra, **self.plasticity.model_extra, **dict.fromkeys(MODULI)}
         if wrong := [name for name in self.fitted if name not in FITTED or name not in known]:
             raise ValueError(f"fitted: {', '.join(wrong)} is not a constant of the law that can be fitted")

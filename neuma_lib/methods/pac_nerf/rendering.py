@@ -6,8 +6,6 @@ to the number of points. `render_in_pieces` limits the number at a time, and `su
 before the next is rendered.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -22,18 +20,13 @@ from neuma_lib.methods.pac_nerf.lattice import Lattice, interpolate
 from neuma_lib.methods.pac_nerf.marching_kernels import kernels, place_of, warp_types
 from neuma_lib.splatting.cameras import Cameras
 
-FEATURES = 12
-"""Number of colour features of a node, in addition to its raw density."""
-STEP = 0.5
-"""Distance between two points of a ray [voxels]."""
+FEATURES = 12  # number of colour features of a node, in addition to its raw density
+STEP = 0.5  # distance between two points of a ray [voxels]
 INTERVAL = 0.1
 """Exponent of the transmittance of a voxel on the coarsest lattice (PAC-NeRF), proportional to the voxel."""
-NEAR = 0.1
-"""Distance from the camera at which rays start [m]."""
-MIN_LIGHT = 1e-7
-"""Weight T alpha up to which a point is omitted, without gradient."""
-END_LIGHT = 1e-3
-"""Transmittance below which a ray ends (DVGO)."""
+NEAR = 0.1  # distance from the camera at which rays start [m]
+MIN_LIGHT = 1e-7  # weight T alpha up to which a point is omitted, without gradient
+END_LIGHT = 1e-3  # transmittance below which a ray ends (DVGO)
 POINTS_AT_ONCE = {"cpu": 2**16, "cuda": 2**20}
 """Maximum number of points plus rays in a piece of an image, by type of device.
 
@@ -45,15 +38,10 @@ saves launches.
 
 @dataclass(frozen=True)
 class Opacity:
-    """Shifted softplus: alpha = 1 - (1 + exp(d + b))^-interval with b = log(1 / (1 - initial) - 1).
+    """Shifted softplus: alpha = 1 - (1 + exp(d + b))^-interval with b = log(1 / (1 - initial) - 1)."""
 
-    Attributes:
-        initial: opacity of raw density 0 over an interval of 1.
-        base_voxel: voxel of the coarsest lattice [m], over which the exponent of a ray is `INTERVAL`.
-    """
-
-    initial: float
-    base_voxel: float
+    initial: float  # opacity of raw density 0 over an interval of 1
+    base_voxel: float  # voxel of the coarsest lattice [m], over which the exponent of a ray is `INTERVAL`
 
     @property
     def shift(self) -> float:
@@ -126,12 +114,8 @@ def render(
     `END_LIGHT`) have no gradient.
 
     Args:
-        lattice: positions of the nodes.
         values: raw density and features at the nodes, (X, Y, Z, 1 + C).
-        opacity: activation of the density.
-        colours: colour network.
         origins, directions: origins [m] and unit directions of the rays, (R, 3).
-        background: colour behind the lattice.
         counts: number of points of each ray, (R,), if known (`count_points`).
 
     Returns:

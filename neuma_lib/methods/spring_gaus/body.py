@@ -15,17 +15,11 @@ from neuma_lib.sim.state import State, Trajectory
 
 @dataclass(frozen=True)
 class SpringBody:
-    """A body with particles of which some are anchors.
+    """A body with particles of which some are anchors."""
 
-    Attributes:
-        index: particles that are anchors, int64, shape (A,).
-        network: springs between the anchors.
-        follow: interpolation from the anchors to all N particles.
-    """
-
-    index: Tensor
-    network: SpringNetwork
-    follow: Interpolation
+    index: Tensor  # particles that are anchors, int64, shape (A,)
+    network: SpringNetwork  # springs between the anchors
+    follow: Interpolation  # interpolation from the anchors to all N particles
 
     @classmethod
     def of(

@@ -5,8 +5,6 @@ each frame with the gradient through the substeps since the previous frame, whos
 one step for the whole video with the gradient through all substeps.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -29,29 +27,19 @@ from neuma_lib.sim.state import State
 
 @dataclass
 class SpringHistory:
-    """Training curves with one entry per iteration, before its optimiser steps.
+    """Training curves with one entry per iteration, before its optimiser steps."""
 
-    Attributes:
-        loss: mean squared error over all frames.
-        modulus: Young's modulus of the network [Pa].
-        softness: parameter of the soft vector.
-        friction, resistance, gap: see `Springs.values`.
-        substeps: substeps per time step.
-        lr_scale: factor on the learning rate after recoveries.
-        recoveries: returns to the best state.
-        seconds: wall time [s].
-    """
-
-    loss: list[float] = field(default_factory=list)
-    modulus: list[float] = field(default_factory=list)
-    softness: list[float] = field(default_factory=list)
+    loss: list[float] = field(default_factory=list)  # mean squared error over all frames
+    modulus: list[float] = field(default_factory=list)  # Young's modulus of the network [Pa]
+    softness: list[float] = field(default_factory=list)  # parameter of the soft vector
+    # friction, resistance, gap: see `Springs.values`
     friction: list[float] = field(default_factory=list)
     resistance: list[float] = field(default_factory=list)
     gap: list[float] = field(default_factory=list)
-    substeps: list[int] = field(default_factory=list)
-    lr_scale: list[float] = field(default_factory=list)
-    recoveries: list[dict] = field(default_factory=list)
-    seconds: list[float] = field(default_factory=list)
+    substeps: list[int] = field(default_factory=list)  # substeps per time step
+    lr_scale: list[float] = field(default_factory=list)  # factor on the learning rate after recoveries
+    recoveries: list[dict] = field(default_factory=list)  # returns to the best state
+    seconds: list[float] = field(default_factory=list)  # wall time [s]
 
 
 @dataclass
@@ -94,8 +82,6 @@ def fit_springs(
     """Optimise the parameters of the springs so that the particles match the video.
 
     Args:
-        model: time step, gravity and box.
-        body: particles and network.
         springs: the network with its parameters, which are optimised in place.
         start: particles with their initial motion.
         loss: loss of the states of the particles at the frames.

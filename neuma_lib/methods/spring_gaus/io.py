@@ -1,7 +1,5 @@
 """Files of fitted networks of springs."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

@@ -11,7 +11,6 @@ Anchor i has a list of neighbours j and a stiffness k_i (Spring-Gaus, Zhong et a
 with L n = x_j - x_i and the rest length l_ij. Elongations below `SLACK` have no force, as in the authors' code.
 """
 
-# No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
 import functools
 from types import SimpleNamespace
 
@@ -22,10 +21,8 @@ from neuma_lib.device import start_warp, typed
 
 start_warp()
 
-SLACK = 1e-6
-"""Elongation below which a spring has no force [m]."""
-MIN_LENGTH = 1e-12
-"""Distance of two anchors below which their direction is undefined [m]."""
+SLACK = 1e-6  # elongation below which a spring has no force [m]
+MIN_LENGTH = 1e-12  # distance of two anchors below which their direction is undefined [m]
 
 
 @functools.cache

@@ -1,7 +1,5 @@
 """Spring-Gaus (Zhong et al., ECCV 2024): a network of springs in the body, without a material law."""
 
-from __future__ import annotations
-
 from neuma_lib.config.training import TrainingConfig
 from neuma_lib.methods.base import Case, Files, Method, Preset
 from neuma_lib.methods.spring_gaus.options import SpringsConfig

@@ -1,7 +1,5 @@
 """The motion of a body by fitted springs."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

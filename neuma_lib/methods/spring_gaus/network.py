@@ -38,20 +38,13 @@ class SpringNetwork:
 
     Springs are directed: the force on i from j has the stiffness of i, and j is pulled by i only if i is in its list.
     Momentum and angular momentum are therefore not exactly conserved, as published.
-
-    Attributes:
-        anchors: positions at rest [m], shape (A, 3).
-        neighbours: indices of the neighbours, int32, shape (A, K).
-        rest: rest lengths [m], shape (A, K).
-        hard: number of nearest springs per anchor whose eta is always 1.
-        exponent: p of the force, see `kernels`.
     """
 
-    anchors: Tensor
-    neighbours: Tensor
-    rest: Tensor
-    hard: int
-    exponent: float = 0.5
+    anchors: Tensor  # positions at rest [m], shape (A, 3)
+    neighbours: Tensor  # indices of the neighbours, int32, shape (A, K)
+    rest: Tensor  # rest lengths [m], shape (A, K)
+    hard: int  # number of nearest springs per anchor whose eta is always 1
+    exponent: float = 0.5  # p of the force, see `kernels`
 
     @classmethod
     def of(cls, anchors: Tensor, neighbours: int, hard: int, exponent: float = 0.5) -> SpringNetwork:
@@ -153,7 +146,6 @@ class Springs(nn.Module):
         modulus.
 
         Args:
-            network: network of the other body.
             density, other_density: mass densities of this body and of the other one [kg/m^3].
         """
         other = Springs(network, 1.0, 1.0)

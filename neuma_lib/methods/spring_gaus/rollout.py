@@ -23,20 +23,14 @@ MAX_SUBSTEPS = 256
 
 @dataclass(frozen=True)
 class SpringModel:
-    """Constants of the simulation.
+    """Constants of the simulation."""
 
-    Attributes:
-        dt: time step between consecutive frame numbers [s].
-        gravity: acceleration [m/s^2].
-        low, high: coordinates of the planes on every axis, without the gap of the springs [m].
-        substeps: minimum number of substeps per time step.
-    """
-
-    dt: float
-    gravity: tuple[float, float, float]
+    dt: float  # time step between consecutive frame numbers [s]
+    gravity: tuple[float, float, float]  # acceleration [m/s^2]
+    # low, high: coordinates of the planes on every axis, without the gap of the springs [m]
     low: float
     high: float
-    substeps: int = 1
+    substeps: int = 1  # minimum number of substeps per time step
 
     @classmethod
     def of(cls, model: MPM, substeps: int = 1) -> SpringModel:
@@ -68,7 +62,6 @@ def spring_rollout(
     Args:
         model: time step, gravity and box. The number of substeps is that of `SpringNetwork.stable_step`, at least
             ``model.substeps``, and is doubled while the simulation diverges.
-        springs: network and its parameters.
         x0, v0: initial positions [m] and velocities [m/s] of the anchors, shape (A, 3).
         frames: time steps of the frames, increasing, not less than ``first``.
         first: time step of the initial state.

@@ -4,8 +4,6 @@ released loop); covariances stretched by the elastic deformation (paper) or by t
 in the paper.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from operator import itemgetter
 

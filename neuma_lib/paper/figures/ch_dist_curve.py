@@ -4,8 +4,6 @@ body, which compares shapes only. Grey: below the sampling floor, the distance b
 body. Before contact, the motion does not depend on the material. Paper: fig:ch_dist_curve (Chamfer distances).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 

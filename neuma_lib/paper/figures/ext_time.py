@@ -2,8 +2,6 @@
 and the mean height of the body over time. Grey: the observed part. Paper: fig:ext_time.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from matplotlib.figure import Figure
 

@@ -3,8 +3,6 @@ plastic network over the iterations, their medians, and how far the merged weigh
 titles name the laws of the prior that are wrong. Paper: fig:gradient_analysis.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from statistics import median
 

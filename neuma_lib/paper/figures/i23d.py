@@ -3,8 +3,6 @@ Particles fill the surface that renders of the splat show, and move its Gaussian
 fig:i23d.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from matplotlib.figure import Figure

@@ -5,8 +5,6 @@ scenes. NCLaw is the prior rendered by Particle-GS (the paper's NCLaw+R). PAC-Ne
 its radiance field. Paper: fig:image_quality.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from operator import itemgetter
 
@@ -22,10 +20,8 @@ MEASURES = {
     "lpips_vgg": "LPIPS (VGG) ↓",
     "lpips_alex": "LPIPS (Alex) ↓",
 }
-SPREAD = 0.62
-"""Share of a scene's slot that the methods fill side by side."""
-LEGEND_COLUMNS = 5
-"""Maximum number of names in a row of the legend."""
+SPREAD = 0.62  # share of a scene's slot that the methods fill side by side
+LEGEND_COLUMNS = 5  # maximum number of names in a row of the legend
 
 
 def data(inputs, params, log) -> dict:

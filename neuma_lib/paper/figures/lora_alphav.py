@@ -3,8 +3,6 @@ slightly beyond (dashed). Left: renders. Right: mean height of the body over tim
 becomes non-finite, which can happen beyond 1, is held at its last finite frame. Paper: fig:lora_alphav.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import matplotlib
@@ -23,8 +21,7 @@ from neuma_lib.paper.image_grid import GAP, ImageGrid, draw_images, note, place
 from neuma_lib.sim.prediction import predict
 
 LEFT, LEGEND, TITLE, PICTURES, CURVES, BETWEEN = 0.5, 0.2, 0.34, 4.0, 1.85, 0.38
-APART = 0.002
-"""Minimum difference of heights that counts [m]. Before contact, all motions are equal."""
+APART = 0.002  # minimum difference of heights that counts [m]. Before contact, all motions are equal.
 
 
 def data(inputs, params, log) -> ImageGrid:

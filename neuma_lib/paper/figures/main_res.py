@@ -3,8 +3,6 @@ view. Renders have a higher resolution than the video; those of PAC-NeRF on its 
 of its radiance field. Paper: fig:main_res.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from matplotlib.figure import Figure
 

@@ -9,8 +9,6 @@ video determines elastic law and return map together, so each alone may differ f
 are cut at the edge of the panel. Not in the paper.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

@@ -2,8 +2,6 @@
 clay, and sand runs through an hourglass, which is drawn as glass. Not in the paper.
 """
 
-from __future__ import annotations
-
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -29,8 +27,7 @@ DIRECTION = np.array([0.35, 0.36, 1.0])
 """From the scene to the camera: so far above the floor that no horizon is in the frame."""
 FLOOR, FLOOR_REACH = (0.93, 0.93, 0.91), 40.0
 """Colour of the floor, and half of its side [m], so that it fills the frame."""
-GLASS = 0.08
-"""Opacity of an obstacle around a body."""
+GLASS = 0.08  # opacity of an obstacle around a body
 
 
 def data(inputs, params, log) -> ImageGrid:

@@ -2,8 +2,6 @@
 are those of the methods in all figures. Paper: fig:particles_app.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from matplotlib.figure import Figure
 

@@ -2,8 +2,6 @@
 video), and played on with one body taken out: by the identified and by the true laws. Not in the paper.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from matplotlib.figure import Figure
 

@@ -3,8 +3,6 @@ views at the start; particles in the colours of the Gaussians bound to them; the
 render, the observation, and their difference, which training reduces. Paper: fig:structure.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import matplotlib
@@ -31,20 +29,15 @@ from neuma_lib.splatting.rasterizer import rasterize
 from neuma_lib.splatting.spherical_harmonics import rgb_to_sh0, sh0_to_rgb
 
 LEFT, RIGHT, HEAD, TITLES = 0.8, 0.42, 0.2, 0.16
-SHOWN = 5
-"""Number of pictures of each stage."""
+SHOWN = 5  # number of pictures of each stage
 _SHRINK, _OPAQUE = 0.45, 0.8
 """Scale of the Gaussians, and their minimum opacity, in the picture that shows each of them."""
 _LIGHT = np.array([-0.45, 0.75, 0.5]) / np.linalg.norm([-0.45, 0.75, 0.5])
 """Direction to the light in the world (y up, the frontal camera at +z)."""
-_AMBIENT = 0.35
-"""Brightness of a face without light."""
-_NEUTRAL = np.array([0.72, 0.75, 0.80])
-"""Colour of objects without one."""
-_THICKNESS = 1e-8
-"""Variance of the splats of the surface normal to their faces [m^2]."""
-_STRONGEST = 0.95
-"""Quantile of the stresses at the end of the colour map."""
+_AMBIENT = 0.35  # brightness of a face without light
+_NEUTRAL = np.array([0.72, 0.75, 0.80])  # colour of objects without one
+_THICKNESS = 1e-8  # variance of the splats of the surface normal to their faces [m^2]
+_STRONGEST = 0.95  # quantile of the stresses at the end of the colour map
 
 
 def data(inputs, params, log) -> ImageGrid:

@@ -2,8 +2,6 @@
 adaptation helps. Crosses: something failed. Not in the paper.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from matplotlib.figure import Figure

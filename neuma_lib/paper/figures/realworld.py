@@ -3,8 +3,6 @@ camera. Right: PSNR and LPIPS (VGG) of the object, means over all cameras and me
 fig:realworld.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from matplotlib.figure import Figure

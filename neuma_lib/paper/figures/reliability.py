@@ -3,8 +3,6 @@ diagonal, intervals have the coverage that they state. Shaded: 95 % confidence b
 the paper.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from matplotlib.figure import Figure

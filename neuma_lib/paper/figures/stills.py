@@ -3,8 +3,6 @@ Grey: both silhouettes; orange: observed only; blue: predicted only; light grey:
 Not in the paper.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from matplotlib.figure import Figure
 from PIL import Image

@@ -3,8 +3,6 @@ of methods that know the two densities or assume one. Bars: tracer RMSE and Cham
 another floor). Paper: fig:uneven_mass.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
@@ -16,8 +14,7 @@ from neuma_lib.paper.claims import shown
 from neuma_lib.paper.image_grid import GAP, ImageGrid, draw_images, note, place
 
 LEFT, TOP, BARS = 0.98, 0.2, 1.25
-PAPER = 1.33
-"""Chamfer distance of the paper [1e-4 m^2], including the sampling floor of its particles."""
+PAPER = 1.33  # Chamfer distance of the paper [1e-4 m^2], including the sampling floor of its particles
 
 
 def data(inputs, params, log) -> ImageGrid:

@@ -3,8 +3,6 @@ glyph. Blue: the scene in which the material was learned. (b) Scenes of several 
 learned from its own video. Paper: fig:vis_generalize, with distances in table 2.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from matplotlib.figure import Figure
 
