@@ -144,6 +144,7 @@ def _new_capture(options: argparse.Namespace) -> None:
     print(f"Created {file}. docs/capture.md explains how to photograph and film. Next:")
     print(f"  snakemake --cores 2 {settings.captures.root}/board.pdf   # print it and lay it on the floor")
     print(f"  copy your files to {folder}/photos, {folder}/stills and {folder}/videos")
+    print(f"  neuma select {folder}   # if other objects are around: mark yours in a browser")
     print(f"  neuma check {file}")
     print(f"  snakemake --cores 2 results/{options.name}/capture.md")
 

@@ -118,7 +118,7 @@ def test_rates_decay_geometrically(duck, monkeypatch):
         assert [each[name] for each in rates] == pytest.approx([first * end ** (k / 4) for k in range(4)])
 
 
-def test_ssim_equals_skimage():
+def test_ssim_equals_skimage_and_gradients_are_finite_differences():
     generator = torch.Generator().manual_seed(0)
     a = torch.rand(1, 40, 33, 3, generator=generator, dtype=torch.float64)
     b = (a + 0.2 * torch.rand(1, 40, 33, 3, generator=generator, dtype=torch.float64)).clamp(0, 1)
@@ -129,6 +129,8 @@ def test_ssim_equals_skimage():
     inner = (slice(5, -5), slice(5, -5))  # where no window leaves the image
     actual = ssim_map(a, b)[0].movedim(0, -1).numpy()
     assert np.abs(actual[inner] - expected[inner]).max() < 1e-9
+    small = [image[:, :7, :6].clone().requires_grad_() for image in (a, b)]
+    assert torch.autograd.gradcheck(ssim_map, small)
 
 
 def test_empty_mask_is_named(duck):
