@@ -50,6 +50,7 @@ def filmed(frames, times, masks, view, flown):
 @pytest.mark.parametrize("seed", range(4))
 def test_the_place_of_contact_gives_one_camera_its_distance(seed):
     """A ball that jumps, in a room whose unit is not a metre: its gravity states the unit."""
+    pytest.importorskip("cv2")
     rng = np.random.default_rng(seed)
     unit, eye = rng.uniform(0.5, 3.0), np.array([rng.uniform(-0.5, 0.5), rng.uniform(0.4, 0.9), 1.2])
     view = looking_at(eye, (0.0, 0.15, 0.0), up=(0.0, 1.0, 0.0))

@@ -50,15 +50,22 @@ def picture(page, selector="canvas", limit=20):
     pytest.fail(f"the picture of {selector} still changes after {limit} s")
 
 
+def go_to(page, frame):
+    """Move the slider. Value and event are one call, because a page that plays sets the value between two."""
+    page.evaluate(
+        "t => { const s = document.getElementById('time'); s.value = t; s.dispatchEvent(new Event('input')); }",
+        frame,
+    )
+    page.wait_for_selector(f"body[data-frame='{frame}']")
+
+
 def first_picture(page):
     """The picture of a file's page that is ready; it starts to play, and is paused at the start."""
     page.wait_for_selector("body[data-state=ready]")
     page.wait_for_selector("body[data-frame='1']")
     assert page.inner_text("#play") == "Pause"
-    page.evaluate("document.getElementById('time').value = 0")
-    page.dispatch_event("#time", "input")
+    go_to(page, 0)
     assert page.inner_text("#play") == "Play"
-    page.wait_for_selector("body[data-frame='0']")
     first = picture(page)
     assert differ(first, np.full_like(first, 255)) > 0.02, "something is drawn"
     return first
@@ -88,11 +95,7 @@ def test_the_file_opens_without_a_server_plays_and_follows_its_controls(folder, 
         assert limits and page.inner_text("#message") == "\n".join(limits)
 
         def at(frame):
-            page.evaluate(
-                "t => { const s = document.getElementById('time'); s.value = t; s.dispatchEvent(new Event('input')); }",
-                frame,
-            )
-            page.wait_for_selector(f"body[data-frame='{frame}']")
+            go_to(page, frame)
             return picture(page)
 
         last = at(len(STEPS) - 1)
