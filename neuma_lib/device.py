@@ -23,7 +23,7 @@ from neuma_lib.errors import InputError
 
 
 def choose_device(name: str = "auto") -> torch.device:
-    """The device of a name; "auto" is CUDA if it is available. Raises InputError: torch finds no CUDA device."""
+    """The device of a name; "auto" is CUDA if it is available. Raises InputError if torch finds no CUDA device."""
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
     if name.startswith("cuda") and not torch.cuda.is_available():

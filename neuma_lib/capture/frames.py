@@ -167,7 +167,7 @@ def repeated_frames(changes: np.ndarray) -> np.ndarray:
 
 
 def check_times(times: Sequence[float], path: str | Path) -> np.ndarray:
-    """Times (N,) of a video as an array. Raises InputError: fewer than two, one is missing, or they do not ascend."""
+    """Times (N,) of a video as an array. Raises InputError for fewer than two, a missing one, or wrong order."""
     times = np.asarray(times, np.float64)
     if len(times) < 2:
         raise InputError(path, f"{len(times)} frames, at least two are required", "Film the whole fall")

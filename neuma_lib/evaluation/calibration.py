@@ -41,7 +41,7 @@ class Quantiles:
     values: tuple[float, ...]
 
     def at(self, level: float) -> float:
-        """The quantile at a level. Raises InputError: the level is not between 0 and the last of `LEVELS`."""
+        """The quantile at a level. Raises InputError if it is not between 0 and the last of `LEVELS`."""
         if not 0 <= level <= LEVELS[-1]:
             raise InputError("level", f"{level!r} must be between 0 and {LEVELS[-1]}")
         return float(np.interp(level, (0.0, *LEVELS), (0.0, *self.values)))

@@ -92,8 +92,8 @@ class FamilyFit:
     ) -> tuple[list[str], np.ndarray]:
         """Names (m,) and covariance (m, m) of logarithms of positive functions of the constants.
 
-        Their differences are between one standard deviation on either side along the principal axes of the covariance
-        (Julier and Uhlmann 1997), because a derivative vanishes where a constant is close to its bound.
+        The slope along a principal axis of the covariance is that of a secant, from one standard deviation below to one
+        above (Julier and Uhlmann 1997), because a derivative vanishes where a constant is close to its bound.
 
         Args:
             covariance: of the unbounded constants (k, k). None: ``self.covariance``.

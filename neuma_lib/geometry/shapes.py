@@ -407,7 +407,7 @@ NAMES = tuple(_MAKERS)  # named solids, in addition to ``letter_A`` ... ``letter
 
 @cache
 def shape(name: str) -> Shape:
-    """The solid with a name. Raises InputError: unknown name; the message lists the known ones."""
+    """The solid with a name. Raises InputError, which lists the known names, for others."""
     if name in _MAKERS:
         return _MAKERS[name]()
     if re.fullmatch(r"letter_[A-Z]", name):

@@ -81,7 +81,7 @@ def capture_folders(root: str | Path) -> list[Path]:
 
 
 def read_settings(path: str | Path) -> CaptureConfig:
-    """Settings of a capture.yaml. Raises InputError: names the file and each invalid, missing or unknown key."""
+    """Settings of a capture.yaml. Raises InputError with each invalid, missing or unknown key."""
     raw = load_yaml(path, "Create it as in the example of docs/capture.md")
     try:
         return validate(
@@ -92,7 +92,7 @@ def read_settings(path: str | Path) -> CaptureConfig:
 
 
 def inside(folder: str | Path, name: str | Path) -> Path:
-    """A path below a capture's folder. Raises InputError: it is outside the folder, possibly through a link."""
+    """A path below a capture's folder. Raises InputError if a link or ".." leads out of it."""
     root = Path(folder).resolve()
     path = (root / name).resolve()
     if path != root and root not in path.parents:

@@ -61,7 +61,7 @@ def _released_capture(name: str, settings: ReleasedConfig) -> Capture:
 
 
 def checked_capture(folder: Path) -> Capture:
-    """A capture whose scenes can be used. Raises InputError: see `read_capture` and `training_takes`, or its name."""
+    """A capture whose scenes can be used. Raises InputError for its name, or as `read_capture` and `training_takes`."""
     if problem := name_problem(folder.absolute().name):
         raise InputError(folder, problem, "Rename the folder")
     try:

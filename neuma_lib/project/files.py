@@ -60,7 +60,7 @@ class SceneFiles:
         return cls(**{**plain, "runs": tuple(runs), "roots": tuple(plain["roots"])})
 
     def checked(self, path: str | Path) -> Path:
-        """Resolved path of a file in the folders. Raises InputError: it does not exist, or is outside the folders."""
+        """Resolved path of a file in the folders. Raises InputError if it is missing or outside of them."""
         return inside(path, self.roots)
 
 

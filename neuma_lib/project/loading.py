@@ -155,7 +155,7 @@ def _complete(scenes: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read_yaml(path: str | Path) -> dict[str, Any]:
-    """A YAML file as a dict. Raises InputError: see `load_yaml`, or it is not a mapping."""
+    """A YAML file as a dict. Raises InputError as `load_yaml`, or if it is no mapping."""
     content = load_yaml(path, "Give the path of an existing settings file")
     if not isinstance(content or {}, dict):
         raise InputError(path, f"expected lines 'key: value', not a {type(content).__name__}")

@@ -119,7 +119,7 @@ class Observation:
 
 
 def several(videos: Observation | Sequence[Observation]) -> tuple[Observation, ...]:
-    """One or several videos of one motion as a tuple. Raises InputError: no video, or one without frames."""
+    """One or several videos of one motion as a tuple. Raises InputError if there is none, or no frame."""
     result = (videos,) if isinstance(videos, Observation) else tuple(videos)
     if not result or not all(video.frames for video in result):
         raise InputError("videos", "there must be at least one video, and each must have a frame")

@@ -55,7 +55,7 @@ def still_files(root: str | Path, record: str, key: str) -> list[str]:
 
 
 def read_stills(root: str | Path, record: str) -> list[Still]:
-    """All photographs of a record. Raises InputError: a file is missing or damaged, or there is no such record."""
+    """All photographs of a record. Raises InputError if a file or the record is missing or damaged."""
     masks = still_files(root, record, "mask")
     K = _intrinsics(root, "colour")
     path = Path(root, "calibration.json")
@@ -71,7 +71,7 @@ def read_stills(root: str | Path, record: str) -> list[Still]:
 
 
 def swing_files(root: str | Path, folder: str) -> dict[float, str]:
-    """Label maps of a swing, by their times [s]. Raises InputError: the folder has no times."""
+    """Label maps of a swing, by their times [s]. Raises InputError if there are none."""
     path = Path(root, folder, "times.json")
     with reading(path, "times of the label maps of a swing"):
         times = read_json(existing(path, "Give the folder of the records as stills.root"))["figures"]
@@ -79,7 +79,7 @@ def swing_files(root: str | Path, folder: str) -> dict[float, str]:
 
 
 def read_swing(root: str | Path, folder: str) -> dict[float, Still]:
-    """Silhouettes of a swing by their times [s], without markers. Raises InputError: a file is missing or damaged."""
+    """Silhouettes of a swing by their times [s], without markers. Raises InputError if a file is missing or damaged."""
     K, path, camera = _intrinsics(root, "depth"), Path(root, "calibration.json"), np.eye(4)
     with reading(path, "the pose of the second camera"):
         values = read_json(path)

@@ -21,7 +21,7 @@ def save_field(path: str | Path, field: RadianceField, metadata: Mapping[str, An
 
 
 def load_field(path: str | Path) -> tuple[RadianceField, dict[str, Any]]:
-    """A field without gradients, and the metadata of its file. Raises InputError: missing, damaged or foreign file."""
+    """A field without gradients, and the metadata of its file. Raises InputError for a wrong or no file."""
     tensors, metadata = read_weights(path)
     try:
         nodes = metadata["lattice"]
