@@ -286,7 +286,7 @@ def identify_threads(wildcards):
     rules = ("identify", "identify_views", "identify_bodies", "next")
     jobs = list(workflow.dag.needrun_jobs())
     fits = [job for job in jobs if job.rule.name.startswith("fit_")]
-    others = sum(not any("/identified" in file for file in job.input) for job in fits)
+    others = sum(not any(Path(file).name.startswith("identified") for file in job.input) for job in fits)
     return max(1, (workflow.cores - others) // max(1, sum(job.rule.name in rules for job in jobs)))
 
 
