@@ -45,11 +45,17 @@ from neuma_lib.io.mesh import write_mesh
 _LONGEST = 1000  # side of the pictures [px]
 _DURATION = 2.0  # from the start of the first flight [s]
 _BACKGROUND_FRAMES = 61
-_MAX_FLATTENING = 0.2  # of the radius, up to which Hertz' theory holds
-_CONSTANTS = (
-    ("contact_s_band", "duration of contact", "", 1e3, " ms"),
-    ("flattening_of_radius_band", "flattening of the radius, by Hertz,", f"< {_MAX_FLATTENING}", 1.0, ""),
-    ("modulus_per_density_m2_s2_band", "E / (1 - nu^2) for 1000 kg/m^3", "", 1e-3, " MPa"),
+_CONSTANTS = (  # of a ball: key of the report, name, limit, factor and unit on the page
+    ("restitution_band", "restitution", 1.0, 1.0, ""),
+    ("contact_s_band", "duration of contact", None, 1e3, " ms"),
+    (
+        "flattening_of_radius_band",
+        "flattening of the radius, by Hertz,",
+        0.2,
+        1.0,
+        "",
+    ),  # larger: no longer linear
+    ("modulus_per_density_m2_s2_band", "E / (1 - nu^2) for 1000 kg/m^3", None, 1e-3, " MPa"),
 )
 _SHAPE_FRAMES = 40  # at most, from which the shape is measured
 _FOCAL = 1.2  # focal length relative to the picture's width; it nearly cancels for a flight across the view
@@ -152,7 +158,17 @@ def analyse_clip(video: str | Path, folder: str | Path, diameter: float | None =
         chosen = chosen[result.masks[chosen].any(axis=(1, 2))]
         flights.append(_flight(pictures, result.masks, window, times, chosen, diameter, video.name))
     breaks = [b._replace(first=int(window[b.first]), last=int(window[b.last])) for b in result.breaks]
-    report = _report(timeline, flights, breaks, shift, result.masks, window, diameter)
+    used = window[result.masks.any(axis=(1, 2))]
+    report: dict[str, Any] = {
+        "frames": len(timeline.times),
+        "rate": timeline.rate,
+        "repeated": timeline.repeated.tolist(),
+        "camera_shift": shift,
+        "used": [int(used[0]), int(used[-1])],
+        "left_out": [each.plain() for each in breaks],
+        "flights": [flight.report(diameter) for flight in flights],
+        "rebounds": [_rebound(*pair) for pair in pairwise(flights)],
+    }
     _draw_flights(folder / "flights.png", flights, background, video.name)
     pages = {"Masks": "masks.png", "Flights": "flights.png"}
     best = min(report["flights"], key=lambda flight: flight["pixel_deviation"])
@@ -161,13 +177,17 @@ def analyse_clip(video: str | Path, folder: str | Path, diameter: float | None =
     if shape:
         pages["Shape: silhouettes grey and blue, body of revolution grey and red"] = "shape.png"
     for k, (pair, rebound) in enumerate(zip(pairwise(flights), report["rebounds"]), start=1):
-        rises, flying = [flight.rise(diameter) for flight in pair], [flight.used for flight in pair]
-        pixel = best["pixel_m"], best["pixel_deviation"]
-        ball = measure_bounce(rises, flying, result.masks, times, *pixel) if shape and shape.is_ball else None
-        rebound["ball"] = ball
-        if ball:
+        parts = (
+            [flight.rise(diameter) for flight in pair],
+            [flight.used for flight in pair],
+            result.masks,
+            times,
+        )
+        if shape and shape.report["ball"]:
+            rebound["ball"] = measure_bounce(*parts, best["pixel_m"], best["pixel_deviation"])
+        if rebound["ball"]:
             pages[f"Rebound {k}: ends of the silhouettes, free flights and floor"] = f"rebound_{k}.png"
-            _draw_rebound(folder / f"rebound_{k}.png", ball, rises, flying, result.masks, times)
+            _draw_rebound(folder / f"rebound_{k}.png", rebound["ball"], *parts)
     write_json(folder / "clip.json", report)
     write_text(folder / "clip.md", markdown(f"{video.name}: free flight", checks(report), pages))
     return report
@@ -224,28 +244,6 @@ def _width(masks: np.ndarray, places: np.ndarray) -> tuple[float, float]:
     return float(np.median(widths)), float(np.std(widths) / np.sqrt(len(widths)))
 
 
-def _report(
-    timeline: Timeline,
-    flights: Sequence[ClipFlight],
-    breaks: Sequence[Break],
-    shift: float,
-    masks: np.ndarray,
-    window: np.ndarray,
-    diameter: float | None,
-) -> dict[str, Any]:
-    used = window[masks.any(axis=(1, 2))]
-    return {
-        "frames": len(timeline.times),
-        "rate": timeline.rate,
-        "repeated": timeline.repeated.tolist(),
-        "camera_shift": shift,
-        "used": [int(used[0]), int(used[-1])],
-        "left_out": [each.plain() for each in breaks],
-        "flights": [flight.report(diameter) for flight in flights],
-        "rebounds": [_rebound(a, b) for a, b in zip(flights, flights[1:])],
-    }
-
-
 def _shape(flights: Sequence[ClipFlight], masks: np.ndarray) -> Revolution | None:
     """Body of revolution of the slower, less blurred half of the frames. None if too few or too small."""
     frames = np.concatenate([flight.used for flight in flights])
@@ -261,29 +259,18 @@ def _shape(flights: Sequence[ClipFlight], masks: np.ndarray) -> Revolution | Non
 
 
 def _shape_report(shape: Revolution, pixel: float, folder: Path) -> dict[str, Any]:
-    """JSON report of a shape for a length of a pixel [m], with ``shape.png`` and ``shape.ply``."""
+    """JSON report of a shape for a length of a pixel [m]. Writes ``shape.png`` and ``shape.ply``."""
     palette = np.array([(255, 255, 255), (60, 110, 220), (220, 40, 40), (170, 170, 170)], np.uint8)
     some = np.linspace(0, len(shape.pairs) - 1, min(12, len(shape.pairs))).astype(int)
     pictures = [
-        (f"{shape.deviations[k]:.1f} px", palette[shape.pairs[k].T @ (1, 2)].swapaxes(0, 1)) for k in some
+        (f"{shape.deviations[k]:.1f} px", palette[shape.pairs[k, 0] + 2 * shape.pairs[k, 1]]) for k in some
     ]
     picture_sheet(folder / "shape.png", pictures, "silhouettes with the axis vertical", 6)
-    mesh = shape.mesh(pixel)
-    if shape.agrees:
+    mesh = shape.mesh.apply_scale(pixel)
+    if shape.report["agrees"]:
         write_mesh(folder / "shape.ply", mesh.vertices, mesh.faces)
     wide, _, length = np.ptp(mesh.vertices, axis=0).tolist()
-    return {
-        "agrees": shape.agrees,
-        "ball": shape.is_ball,
-        "deviation_px": float(shape.deviations.max()),
-        "other_axis_px": shape.other,
-        "disc_px": shape.disc,
-        "blur_px": shape.blur,
-        "limit_px": shape.limit,
-        "diameter_m": wide,
-        "length_m": length,
-        "volume_m3": float(mesh.volume),
-    }
+    return shape.report | {"diameter_m": wide, "length_m": length, "volume_m3": float(mesh.volume)}
 
 
 def _rebound(before: ClipFlight, after: ClipFlight) -> dict[str, Any]:
@@ -294,6 +281,7 @@ def _rebound(before: ClipFlight, after: ClipFlight) -> dict[str, Any]:
         "between_s": float(after.times[0] - before.times[-1]),
         "restitution": float(-up[1] / down[1]) if down[1] < 0 else None,
         "along_floor": float(up[0] / down[0]) if down[0] else None,
+        "ball": None,
     }
 
 
@@ -319,18 +307,7 @@ def checks(report: dict[str, Any]) -> list[Check]:
         if spin := flight["spin_rad_s"]:
             size, deviation = np.linalg.norm(spin), np.linalg.norm(flight["spin_deviation_rad_s"])
             result.append(Check(f"spin in {name}", f"{size:.1f} +- {deviation:.1f} rad/s", "", True))
-        if k and ((rebound := report["rebounds"][k - 1])["restitution"] is not None or rebound["ball"]):
-            ball, ratio = rebound["ball"] or {}, rebound["restitution"]
-            low, middle, high = ball.get("restitution_band", (ratio, ratio, ratio))
-            text = _band(low, middle, high) if ball else f"{ratio:.2f}"
-            result.append(Check(f"restitution before {name}", text, "0 to 1", 0 < middle < 1))
-            for key, what, wanted, factor, unit in _CONSTANTS if ball else ():
-                text = _band(*(value and factor * value for value in ball[key])) + unit
-                good = not wanted or (ball[key][1] or 0.0) < _MAX_FLATTENING
-                result.append(Check(f"{what} before {name}", text, wanted, good))
-            if (largest := ball.get("largest_flattening_seen_m")) is not None:
-                text = f"{1e3 * largest:.1f} mm in {ball['frames_of_contact']} frames of contact"
-                result.append(Check(f"largest visible flattening before {name}", text, "", True))
+        result += _rebound_checks(report["rebounds"][k - 1], name) if k else []
     if shape := report["shape"]:
         text = f"{1e3 * shape['diameter_m']:.1f} mm wide, {1e3 * shape['length_m']:.1f} mm along the axis"
         if shape["blur_px"] > 2 * shape["limit_px"]:
@@ -346,26 +323,36 @@ def checks(report: dict[str, Any]) -> list[Check]:
     return result
 
 
-def _band(low: float | None, middle: float | None, high: float | None) -> str:
-    if middle is not None:
-        return f"{middle:.3g} ({low:.3g} to {high:.3g})"
-    return f"< {high:.3g}" if low is None else f"> {low:.3g}"
+def _rebound_checks(rebound: dict[str, Any], name: str) -> list[Check]:
+    if not (ball := rebound["ball"]):
+        ratio = rebound["restitution"]
+        text, good = f"{ratio or 0:.2f}", 0 < (ratio or 0) < 1
+        return [] if ratio is None else [Check(f"restitution before {name}", text, "0 to 1", good)]
+    result = []
+    for key, what, limit, factor, unit in _CONSTANTS:
+        low, middle, high = (value and factor * value for value in ball[key])
+        text = (
+            f"{middle:.3g} ({low:.3g} to {high:.3g})"
+            if middle
+            else f"> {low:.3g}"
+            if low
+            else f"< {high:.3g}"
+        )
+        good = limit is None or (low or 0.0) < limit
+        result.append(Check(f"{what} before {name}", text + unit, f"< {limit}" if limit else "", good))
+    if largest := ball["largest_flattening_seen_m"]:
+        text = f"{1e3 * largest:.1f} mm in {ball['frames_of_contact']} frames of contact"
+        result.append(Check(f"largest visible flattening before {name}", text, "", True))
+    return result
 
 
-def _draw_rebound(
-    path: Path,
-    ball: dict[str, Any],
-    rises: Sequence[Rise],
-    flying: Sequence[np.ndarray],
-    masks: np.ndarray,
-    times: np.ndarray,
-) -> None:
+def _draw_rebound(path: Path, ball: dict[str, Any], rises: list[Rise], flying: list, masks, times) -> None:
     frames = [k for k in range(flying[0][-5], flying[1][4] + 1) if masks[k].any()]
+    heights = np.array([ends(masks[k]) for k in frames]) - ball["floor_px"]
+    t = np.linspace(times[frames[0]], times[frames[-1]], 200)
     figure = new_figure(9, 5)
     axes = figure.subplots()
-    heights = np.array([ends(masks[k]) for k in frames]) - ball["floor_px"]
     axes.plot(1e3 * times[frames], heights, "o", label=["lowest point", "highest point"])
-    t = np.linspace(times[frames[0]], times[frames[-1]], 200)
     for rise in rises:
         axes.plot(1e3 * t, rise.state(t)[0] - ball["radius_px"] - ball["floor_px"], "k-", lw=1)
     axes.axhline(0.0, color="tab:brown")

@@ -51,8 +51,8 @@ def test_a_turning_body_of_revolution_is_rebuilt(name, tmp_path):
     """Drawing, turning and centring round an end by half a pixel each. A tilt of one step, 5 degrees, adds length."""
     mesh = BODIES[name]
     fit = fit_revolution(drawn(mesh, TILTS), VELOCITIES)
-    assert fit.agrees and not fit.is_ball
-    rebuilt, (wide, _, length) = fit.mesh(1.0), np.ptp(mesh.vertices, axis=0)
+    assert fit.report["agrees"] and not fit.report["ball"]
+    rebuilt, (wide, _, length) = fit.mesh, np.ptp(mesh.vertices, axis=0)
     assert np.ptp(rebuilt.vertices[:, 0]) == pytest.approx(wide, abs=3)
     assert np.ptp(rebuilt.vertices[:, 2]) == pytest.approx(length, abs=3 + wide * np.sin(np.radians(5)))
     write_mesh(tmp_path / "shape.ply", rebuilt.vertices, rebuilt.faces)
@@ -62,8 +62,8 @@ def test_a_turning_body_of_revolution_is_rebuilt(name, tmp_path):
 def test_a_ball_is_one():
     ball = trimesh.creation.icosphere(subdivisions=4, radius=14.3)
     fit = fit_revolution(drawn(ball, TILTS), VELOCITIES)
-    assert fit.agrees and fit.is_ball
-    assert fit.mesh(1.0).volume == pytest.approx(ball.volume, rel=0.1)
+    assert fit.report["agrees"] and fit.report["ball"]
+    assert fit.mesh.volume == pytest.approx(ball.volume, rel=0.1)
 
 
 def test_bodies_without_an_axis_and_blurred_balls_are_refused():
@@ -73,11 +73,15 @@ def test_bodies_without_an_axis_and_blurred_balls_are_refused():
     for turn in Rotation.random(9, random_state=2):
         points = turn.apply(box.vertices)[:, :2] + SIZE / 2 + rng.uniform(-0.5, 0.5, 2)
         masks.append(silhouette(points, box.faces, SIZE, SIZE))
-    assert not fit_revolution(np.array(masks), VELOCITIES).agrees
+    assert not fit_revolution(np.array(masks), VELOCITIES).report["agrees"]
     head = trimesh.creation.icosphere(radius=9).apply_translation([15, 0, 6])
     duck = trimesh.util.concatenate([bottle(), head])
-    assert not fit_revolution(drawn(duck, TILTS), VELOCITIES).agrees
+    assert not fit_revolution(drawn(duck, TILTS), VELOCITIES).report["agrees"]
     y, x = np.mgrid[:SIZE, :SIZE] - 60.0
     blurred = [np.hypot(np.maximum(np.abs(x) - 5, 0), y) <= 15] * 9  # a disc that moves by 10 px
     fit = fit_revolution(np.array(blurred), np.tile([1.0, 0.0], (9, 1)))
-    assert fit.deviations.max() <= fit.limit and fit.blur == pytest.approx(10, abs=1) and not fit.agrees
+    assert (
+        fit.deviations.max() <= fit.report["limit_px"]
+        and fit.report["blur_px"] == pytest.approx(10, abs=1)
+        and not fit.report["agrees"]
+    )

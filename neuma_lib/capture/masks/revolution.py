@@ -8,7 +8,7 @@ Motion blur looks like a rod along the motion, so silhouettes that are longer al
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
@@ -22,33 +22,13 @@ _MAX_RADIUS = 40.0  # radius of a silhouette that is compared [px]. Larger ones 
 _TILTS = np.radians(np.arange(0, 91, 5))  # of the axis out of the picture plane
 
 
-@dataclass(frozen=True, eq=False)
-class Revolution:
-    """The best body of revolution of silhouettes. Lengths in pixels of the video."""
+class Revolution(NamedTuple):
+    """The best body of revolution of T silhouettes. Lengths in pixels of the video."""
 
-    profile: np.ndarray  # position along the axis and radius, (N, 2)
+    mesh: trimesh.Trimesh  # closed surface about the z axis
     deviations: np.ndarray  # mean distance between the edges of each silhouette and of the body, (T,)
-    other: float  # the largest one if the axis is the other one of the silhouettes
-    disc: float  # largest deviation from discs
-    blur: float  # median length of the silhouettes along their motion less that across it
-    limit: float  # tolerated deviation
     pairs: np.ndarray  # each silhouette, turned so that the axis is vertical, and the body's, (T, 2, M, M)
-
-    @property
-    def agrees(self) -> bool:
-        """Whether all silhouettes are those of the body, without blur."""
-        return bool(max(self.deviations.max(), self.blur / 2) <= self.limit)
-
-    @property
-    def is_ball(self) -> bool:
-        """Whether all silhouettes are discs."""
-        return max(self.disc, self.blur / 2) <= self.limit
-
-    def mesh(self, scale: float) -> trimesh.Trimesh:
-        """Closed surface about the z axis [m], for a length of a pixel [m]."""
-        z, r = scale * self.profile.T
-        line = np.concatenate([[[0, z[0]]], np.stack([r, z], axis=1), [[0, z[-1]]]])
-        return trimesh.creation.revolve(line, sections=48)
+    report: dict[str, Any]  # largest deviations, those tolerated, and whether it is one, or a ball
 
 
 def fit_revolution(masks: np.ndarray, velocities: np.ndarray) -> Revolution:
@@ -79,15 +59,27 @@ def fit_revolution(masks: np.ndarray, velocities: np.ndarray) -> Revolution:
     inside = np.flatnonzero(profile >= 0.5)
     rows = np.arange(inside[0], inside[-1] + 1)
     z = np.concatenate([rows[:1] - 0.5, rows, rows[-1:] + 0.5]) - half
-    line = np.stack([z / scale, np.maximum(np.pad(profile[rows], 1, mode="edge"), 0.5)], axis=1)
+    radii = np.pad(np.maximum(np.pad(profile[rows], 1, mode="edge"), 0.5), 1)
+    line = np.stack([radii, np.pad(z / scale, 1, mode="edge")], axis=1)
     y, x = np.mgrid[-half : half + 1, -half : half + 1]
     disc = max(_distance(t, x**2 + y**2 <= t.sum() / np.pi) for t in turned) / scale
-    blurs = [
-        np.subtract(*np.ptp(np.argwhere(mask)[:, ::-1] @ [[u, -v], [v, u]], axis=0)) / np.hypot(u, v)
-        for mask, (u, v) in zip(masks, velocities)
-    ]
+    blur = np.median(
+        [
+            np.subtract(*np.ptp(np.argwhere(mask)[:, ::-1] @ [[u, -v], [v, u]], axis=0)) / np.hypot(u, v)
+            for mask, (u, v) in zip(masks, velocities)
+        ]
+    )
     limit = max(1.0, TOLERANCE * radius)
-    return Revolution(line, deviations, float(other.max()), disc, float(np.median(blurs)), limit, pairs)
+    report = {
+        "deviation_px": float(deviations.max()),
+        "other_axis_px": float(other.max()),
+        "disc_px": disc,
+        "blur_px": float(blur),  # length along the motion less that across it
+        "limit_px": limit,
+        "agrees": bool(max(deviations.max(), blur / 2) <= limit),
+        "ball": bool(max(disc, blur / 2) <= limit),
+    }
+    return Revolution(trimesh.creation.revolve(line, sections=48), deviations, pairs, report)
 
 
 def _turned(mask: np.ndarray, axis: np.ndarray, scale: float, half: int) -> np.ndarray:
