@@ -65,8 +65,8 @@ def add_commands(commands: Any) -> None:
         _view,
         "view: show a scene's motions in a browser",
         "Serves the motions of a scene to a browser, with a live mode that simulates its object under any learned law. "
-        "Example: neuma view results/BouncyBall. With --file it writes one HTML page instead, without a server. For the "
-        "folder of a capture, it does what neuma select does.",
+        "Example: neuma view results/BouncyBall. With --file it writes one HTML page instead, without a server. For a "
+        "capture's folder, it does what neuma select does.",
         argument("folder", metavar="FOLDER", help="folder of a scene, such as results/BouncyBall"),
         argument("--file", help="write one HTML file that needs no server, and exit"),
         argument("--host", default="127.0.0.1", help="address (default %(default)s, this machine)"),
