@@ -65,7 +65,8 @@ def add_commands(commands: Any) -> None:
         _view,
         "view: show a scene's motions in a browser",
         "Serves the motions of a scene to a browser, with a live mode that simulates its object under any learned law. "
-        "Example: neuma view results/BouncyBall. With --file it writes one HTML page instead, without a server.",
+        "Example: neuma view results/BouncyBall. With --file it writes one HTML page instead, without a server. For a "
+        "capture's folder, it does what neuma select does.",
         argument("folder", metavar="FOLDER", help="folder of a scene, such as results/BouncyBall"),
         argument("--file", help="write one HTML file that needs no server, and exit"),
         argument("--host", default="127.0.0.1", help="address (default %(default)s, this machine)"),
@@ -179,6 +180,8 @@ def _check(options: argparse.Namespace) -> int:
 
 
 def _view(options: argparse.Namespace) -> None:
+    if not options.file and (Path(options.folder) / "capture.yaml").is_file():
+        return _select(options)
     from neuma_lib.viewer.open import view
 
     view(**{key: value for key, value in vars(options).items() if key != "run"})

@@ -48,7 +48,7 @@ def test_own_masks_are_taken_as_they_are(tmp_path):
     with refused("bad.png"):
         module.read_mask(tmp_path / "bad.png", (WIDTH, HEIGHT))
     Image.new("L", (WIDTH, HEIGHT)).save(tmp_path / "empty.png")
-    with refused("empty.png"):
+    with refused("empty.png", problem="it has no white or opaque pixel", remedy="Draw the object in white"):
         module.read_mask(tmp_path / "empty.png", (WIDTH, HEIGHT))
 
 

@@ -116,7 +116,14 @@ def test_a_capture_of_an_unknown_prior_leaves_other_scenes_usable(captures):
 
 
 @pytest.mark.parametrize(
-    ("name", "problem"), [("logs", "reserved"), ("a.b", "letters"), ("mug_one", "mug_one")]
+    ("name", "problem"),
+    [
+        ("logs", "reserved"),
+        ("a.b", "letters"),
+        ("my mug", "letters"),
+        ("m\u00fcg", "letters"),
+        ("mug_one", "mug_one"),
+    ],
 )
 def test_captures_whose_names_are_taken_are_left_out(captures, name, problem):
     (captures / name).mkdir()

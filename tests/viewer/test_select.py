@@ -4,6 +4,7 @@ import pytest
 import yaml
 from PIL import Image
 
+from neuma_lib.cli import main
 from neuma_lib.config.capture import CaptureConfig
 from neuma_lib.viewer.select import write_select_page
 from tests.support.browser import opened
@@ -29,6 +30,14 @@ def test_a_capture_without_photographs_is_refused(tmp_path):
         file.unlink()
     with refused(folder):
         write_select_page(folder)
+
+
+@pytest.mark.parametrize("command", ["select", "view"])
+def test_the_viewer_has_the_page_for_the_folder_of_a_capture(command, tmp_path, capsys):
+    folder = capture(tmp_path / "mug")
+    assert main([command, str(folder)]) == 0
+    assert capsys.readouterr().out == f"Open {folder / 'select.html'} in a browser\n"
+    assert "a b.jpg" in (folder / "select.html").read_text()
 
 
 def test_a_click_and_a_rectangle_become_lines_of_the_settings(tmp_path):
