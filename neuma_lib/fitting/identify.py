@@ -25,7 +25,7 @@ the disagreement of the last frames or of tied families.
 On a coarse grid, most of the loss is discretisation error, which may hide the family. With a refined body, families of
 similar scores are therefore fitted again and selected on a finer grid. The selected family is fitted on both grids. The
 constants of the material follow by extrapolation to a cell size of zero (`FamilyFit.extrapolated`). Those of the coarse
-grid predict best on that grid. With a ``refinement`` of 1, the refined body is on the same grid and only selects.
+grid predict best on that grid. With a ``refinement`` of 1, the refined body is on the same grid and alone is fitted.
 
 The Coulomb coefficient of the body and all its obstacles may be a constant of every family. Where the images also admit
 that the body sticks, the result is a lower bound of the coefficient.
@@ -154,13 +154,16 @@ def identify(
     selected, ties = select_family(list(compared.values()), settings)
     name = selected.family.name
     run = next(run for run in running if run.family is selected.family)
+    again = fine.get(name)
+    if more := again is not None and again.alive and not other_grid:
+        run = again
     starts, first = [run.values], rounds - 1
     # If the first frames misled, restart at the coarsest level.
     if selected.held_out > settings.prune_factor * selected.loss:
         starts = [run.values, *(run.family.with_guesses(values) for values in ({}, published_values))]
         first = 0
     counts = [len(video.frames) for video in videos]
-    final = FamilyRun(run.family, videos, counts, settings)
+    final = FamilyRun(run.family, videos, counts, settings, fine=more)
     final.begin(starts, first, run.deviations)
     for level in range(first + 1, rounds if final.alive else 0):
         final.refine(level)
@@ -169,20 +172,21 @@ def identify(
         for video in videos:
             video.set_friction(math.inf)
         sticking, start = Family(run.family.name, run.family.spec), (final.values, final.deviations)
-        final = FamilyRun(sticking, videos, counts, settings)
+        final = FamilyRun(sticking, videos, counts, settings, fine=more)
         final.begin(start[:1], rounds - 1, start[1])
     # Plateaus are properties of the material that both grids show.
     plateaus = final.covariance_of_plateaus() if final.alive else np.zeros(())
     material = None
-    if other_grid and name in fine and fine[name].alive and final.alive:
+    if other_grid and again and again.alive and final.alive:
         whole = FamilyRun(final.family, videos, counts, settings, fine=True)
-        starts = [{key: each[key] for key in final.values} for each in (fine[name].values, final.values)]
+        starts = [{key: each[key] for key in final.values} for each in (again.values, final.values)]
         whole.begin(starts[: 2 if first == 0 else 1], rounds - 1, final.deviations, like=[final])
         if whole.alive:
             material = _final_fit(whole, plateaus, selected, [compared[tie] for tie in ties])
     if other_grid and material is None:
         log(f"{name}: no constants of the material, because no simulation on the finer grid is finite")
-    best = _final_fit(final, plateaus, fits[name], [fits[tie] for tie in ties])
+    first_fits = compared if more else fits
+    best = _final_fit(final, plateaus, first_fits[name], [first_fits[tie] for tie in ties])
     best.lowest_friction = lowest
     if material is not None:
         material = material.extrapolated(best, settings.refinement)

@@ -268,7 +268,7 @@ class Config(Section):
 
         A truth that was simulated on the grid of `simulation` has no limit for smaller cells. Identification of such
         a scene uses no finer grid, and selects the family on the grid that it shares with the truth. If a candidate has
-        a field, it selects with the refined particles on that grid, because few particles appear as a field.
+        a field, it uses the refined particles on that grid as well, because few particles appear as a field.
 
         Raises:
             InputError: the finer grid would not have more particles than `geometry.particles`.
