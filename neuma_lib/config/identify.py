@@ -41,7 +41,9 @@ class IdentifyConfig(Section):
         "no constants of the material, as for a truth on the grid of `simulation`",
     )
     refinement: float = internal(
-        1.5, "grid cells and steps of the finer grid, relative to the simulation's", ge=1.25
+        1.5,
+        "grid cells and steps of the finer grid, relative to the simulation's; 1: only more particles",
+        ge=1,
     )
     pose_tolerance: float = internal(1e-3, "expected shift [m] and enlargement of the rendered body", ge=0)
     held_out: float = internal(

@@ -90,6 +90,11 @@ class Family:
         same = same and other.field in (None, self.field)
         return bool(more) and same and set(other.constants) < set(self.constants)
 
+    def varies(self, other: Family) -> bool:
+        """Whether this is the other, uniform family with a field."""
+        uniform = tuple(key for key, (part, _) in self._constants.items() if part != "field")
+        return self.field is not None and uniform == other.constants and self.contains(other)
+
     def unbounded(self, values: Values) -> np.ndarray:
         """Unbounded constants (k,): logarithms, or logits of constants with two bounds."""
         return np.array([self.unbounded_of(key, values[key]) for key in self.constants])

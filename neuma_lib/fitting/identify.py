@@ -25,7 +25,7 @@ the disagreement of the last frames or of tied families.
 On a coarse grid, most of the loss is discretisation error, which may hide the family. With a refined body, families of
 similar scores are therefore fitted again and selected on a finer grid. The selected family is fitted on both grids. The
 constants of the material follow by extrapolation to a cell size of zero (`FamilyFit.extrapolated`). Those of the coarse
-grid predict best on that grid.
+grid predict best on that grid. With a ``refinement`` of 1, the refined body is on the same grid and only selects.
 
 The Coulomb coefficient of the body and all its obstacles may be a constant of every family. Where the images also admit
 that the body sticks, the result is a lower bound of the coefficient.
@@ -53,6 +53,7 @@ from neuma_lib.sim.model import MPM, model_of_each
 from neuma_lib.splatting.observation import Observation, joint_frames, several
 
 _CONTENDERS = 3  # families that are compared on the finer grid
+_CLEAR = 2.0  # least logarithm of the ratio of a field relative to its change with other particles
 _OTHER_LIMITS = (-2, -1, 1, 2)  # powers of 4 of the limits of a flow that restarts near another family
 
 
@@ -117,6 +118,7 @@ def identify(
     published_values = _constants(published) if published else {}
     running: list[FamilyRun] = []
     rounds = len(settings.pyramid)
+    other_grid = bool(refined) and settings.refinement > 1
     late = []
     for family in families:
         if rounds > 1 and any(_is_near(family, run.family) for run in running):
@@ -128,17 +130,17 @@ def identify(
         run.restart_from([start, *run.family.with_other_limits(start, _OTHER_LIMITS)])
     total = rounds * len(families)
     for level in range(1, rounds):
-        _prune(running, settings, keep_redundant=bool(refined))
+        _prune(running, settings, keep_redundant=other_grid)
         following = sorted((run for run in running if run.alive), key=lambda run: run.fit.cost)
         if following and level == rounds - 1:
             following[0].differentiate()
         for done, run in enumerate(following):
-            run.refine(level, rough=bool(refined))
+            run.refine(level, rough=other_grid)
             if progress:
                 progress(level * len(families) + done + 1, total, run.loss)
         if level >= rounds - 2:
             running += [
-                _late_fit(family, videos, running, settings, level, rough=bool(refined)) for family in late
+                _late_fit(family, videos, running, settings, level, rough=other_grid) for family in late
             ]
             late = []
     fits = {run.family.name: run.score() for run in running}
@@ -172,13 +174,13 @@ def identify(
     # Plateaus are properties of the material that both grids show.
     plateaus = final.covariance_of_plateaus() if final.alive else np.zeros(())
     material = None
-    if name in fine and fine[name].alive and final.alive:
+    if other_grid and name in fine and fine[name].alive and final.alive:
         whole = FamilyRun(final.family, videos, counts, settings, fine=True)
         starts = [{key: each[key] for key in final.values} for each in (fine[name].values, final.values)]
         whole.begin(starts[: 2 if first == 0 else 1], rounds - 1, final.deviations, like=[final])
         if whole.alive:
             material = _final_fit(whole, plateaus, selected, [compared[tie] for tie in ties])
-    if refined and material is None:
+    if other_grid and material is None:
         log(f"{name}: no constants of the material, because no simulation on the finer grid is finite")
     best = _final_fit(final, plateaus, fits[name], [fits[tie] for tie in ties])
     best.lowest_friction = lowest
@@ -208,12 +210,13 @@ def _on_finer_grid(
     """Fits to the first frames on the finer grid, by name, which continue those on the grid of the model.
 
     They are of at most `_CONTENDERS` families whose held-out loss is at most ``prune_factor`` times the lowest, and of
-    the best family with each return map whose held-out loss is at most the square of it.
+    the best family with each return map whose held-out loss is at most the square of it, and the uniform ones of these.
 
     Images of the finer grid may differ by more than a pixel, hence the fit at the coarsest level first, unless a near
-    family has been fitted there. Derivatives are those of the coarse grid until a step fails. Those with
-    ``prune_factor`` times the lowest loss are not alive, nor those that do not lower the loss of a family with fewer
-    constants by ``penalty`` for each additional one.
+    family has been fitted there, or the grid is the same. Derivatives are those of the coarse grid until a step fails.
+    Those with ``prune_factor`` times the lowest loss are not alive, nor those that do not lower the loss of a family
+    with fewer constants by ``penalty`` for each additional one, nor those with a field whose ratio differs from 1 by a
+    factor that is similar to its change from the other particles and grid.
     """
     ranked = sorted((run for run in running if run.alive), key=lambda run: fits[run.family.name].score)
     lowest, factor = fits[ranked[0].family.name].score if ranked else 0.0, math.log(settings.prune_factor)
@@ -221,6 +224,10 @@ def _on_finer_grid(
     first = {run.family.return_map: run for run in reversed(ranked)}
     close = [run for run in ranked[:_CONTENDERS] if excess[run] <= factor]
     contenders = dict.fromkeys([*close, *(run for run in first.values() if excess[run] <= 1.5 * factor)])
+    contenders |= dict.fromkeys(
+        run for run in ranked if any(own.family.varies(run.family) for own in contenders)
+    )
+    coarse = {run.family.name: run.values for run in contenders}
     flowing, last = [run for run in contenders if run.family.flows], len(settings.pyramid) - 1
     fine: dict[str, FamilyRun] = {}
     for run in sorted(contenders, key=lambda run: len(run.family.constants)):
@@ -229,9 +236,9 @@ def _on_finer_grid(
         again = FamilyRun(run.family, videos, [video.fitted for video in videos], settings, fine=True)
         done = [each for each in fine.values() if each.alive]
         near = [each for each in done if _is_near(run.family, each.family)]
-        if near:
+        if near or settings.refinement == 1:
             starts = [run.family.with_guesses({**run.values, **each.values}) for each in near]
-            again.begin(starts, last, near[0].deviations, like=[run], rough=True)
+            again.begin(starts or [run.values], last, [*near, run][0].deviations, like=[run], rough=True)
         else:
             again.begin([run.values], 0, run.deviations, like=[run])
             if again.alive:
@@ -245,6 +252,11 @@ def _on_finer_grid(
         run.alive = run.fit.cost <= min(
             [settings.prune_factor * min(each.fit.cost for each in done), *simpler]
         )
+    _keep_uniform(done)
+    for run in done:
+        if run.family.field:
+            ratio, before = (math.log(values["ratio"]) for values in (run.values, coarse[run.family.name]))
+            run.alive = run.alive and abs(ratio) > _CLEAR * abs(ratio - before)
     return fine
 
 
@@ -343,16 +355,25 @@ def _prune(running: Sequence[FamilyRun], settings: IdentifyConfig, keep_redundan
 
     Return maps are hardly compared, because the error of a coarse grid, at thin limbs and near the floor, is like
     plastic flow. Families that do not improve on a simpler one at a coarse level are kept, since finer levels have more
-    information, and redundant ones with ``keep_redundant``, for a finer grid.
+    information, and redundant ones with ``keep_redundant``, for a finer grid. The uniform family of one with a field is
+    kept as long as that one, because held-out frames compare them.
     """
     alive = [run for run in running if run.alive]
     best = min((run.fit.cost for run in alive), default=math.inf)
     for run in alive:
         lowest = min(other.fit.cost for other in alive if other.family.return_map == run.family.return_map)
         run.alive = run.fit.cost <= min(settings.prune_factor * lowest, settings.prune_factor**2 * best)
+    _keep_uniform(alive)
     kept = [run for run in alive if run.alive]
     for run in [] if keep_redundant else [run for run in kept if _is_redundant(run, kept)]:
         run.alive = False
+
+
+def _keep_uniform(runs: Iterable[FamilyRun]) -> None:
+    """Keep the uniform family of each one with a field that is kept."""
+    fields = [run.family for run in runs if run.alive]
+    for run in runs:
+        run.alive = run.alive or any(family.varies(run.family) for family in fields)
 
 
 def _is_redundant(run: FamilyRun, others: Sequence[FamilyRun]) -> bool:
@@ -372,15 +393,28 @@ def _fitted_values(running: Sequence[FamilyRun], family: Family) -> list[Values]
 def select_family(fits: Sequence[FamilyFit], settings: IdentifyConfig) -> tuple[FamilyFit, list[str]]:
     """The family with the lowest score, and the names of tied families.
 
-    A family that contains the selected one is not tied, because its additional constants do not lower the score.
+    A family with a field is not selected if it ties with the uniform one, because errors of the particles that sample
+    the body are like a field. A family that contains the selected one is not tied unless its score is lower, because
+    its additional constants do not help.
     """
-    best = min(fits, key=lambda fit: fit.score)
+    best = min(
+        (
+            fit
+            for fit in fits
+            if not any(
+                fit.family.varies(other.family) and other.score - fit.score < settings.tie for other in fits
+            )
+        ),
+        key=lambda fit: fit.score,
+    )
     if not math.isfinite(best.score):
         raise NonFiniteError("identify", "every candidate diverges. Use softer guesses in identify.families")
     return best, [
         fit.family.name
         for fit in fits
-        if fit is not best and fit.score - best.score < settings.tie and not fit.family.contains(best.family)
+        if fit is not best
+        and fit.score - best.score < settings.tie
+        and not (fit.family.contains(best.family) and fit.score >= best.score)
     ]
 
 

@@ -461,6 +461,9 @@ def test_families_with_a_high_cost_and_redundant_ones_are_pruned():
         "return maps are compared by the square of the factor"
     )
     assert not mud.alive
+    uneven = FakeRun(0.2, {**ELASTIC, "field": {"name": "ramp", "ratio": 1.0}}, "uneven")
+    _prune([elastic, sibling, uneven], options)
+    assert elastic.alive and not sibling.alive, "the uniform family of a field is kept, no other"
 
 
 def test_fits_restart_from_better_ones_that_started_later():

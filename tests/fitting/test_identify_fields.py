@@ -5,12 +5,15 @@ import math
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from neuma_lib.config.identify import IdentifyConfig
 from neuma_lib.config.laws import LawConfig
 from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.fitting.families import Family
-from neuma_lib.fitting.identify import identify
+from neuma_lib.fitting.identified import FamilyFit
+from neuma_lib.fitting.identify import identify, select_family
+from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.splatting.observation import Observation
@@ -29,20 +32,25 @@ FAMILIES = {
 }
 
 
-def identified(field, E=4e4, velocity=VELOCITY, seed=5):
-    """The block filmed with noise, identified from a uniform guess."""
-    body, truth = block(), law("hencky", E=E)
+def identified(field, E=4e4, velocity=VELOCITY, seed=5, bodies=None):
+    """The block filmed with noise, identified from a uniform guess.
+
+    Args:
+        bodies: the block with the particles of the truth, of the fit, and refined ones or None.
+    """
+    filmed, body, refined = bodies or (block(), block(), None)
+    truth = law("hencky", E=E)
     with torch.no_grad():
         own = analytic_law({**truth, **({"field": field} if field else {})}, MODEL.dt)
-        path = rollout(MODEL, own, body.state(velocity), steps=FRAMES[-1], frames=FRAMES, total=True)
-        images = body.particle_gs(camera())(path.x, path.F_total)
+        path = rollout(MODEL, own, filmed.state(velocity), steps=FRAMES[-1], frames=FRAMES, total=True)
+        images = filmed.particle_gs(camera())(path.x, path.F_total)
     noise = torch.randn(images.shape, generator=torch.Generator().manual_seed(seed), dtype=images.dtype)
     centre = (body.mass @ body.x0 / body.mass.sum()).numpy()
     motion = InitialMotion(np.array(velocity), np.zeros(3), centre, np.eye(3), np.zeros(6))
     families = {name: LawConfig(**spec) for name, spec in FAMILIES.items()}
-    settings = IdentifyConfig(families=families, pyramid=(4, 8, 32), pose_tolerance=0.0)
+    settings = IdentifyConfig(families=families, pyramid=(4, 8, 32), pose_tolerance=0.0, refinement=1.0)
     video = Observation(FRAMES, images + 0.01 * noise, camera())
-    return identify(MODEL, motion, body, video, settings)
+    return identify(MODEL, motion, body, video, settings, refined=[refined] if refined else [])
 
 
 @pytest.mark.parametrize("ratio", [3.0, 0.3])
@@ -68,11 +76,51 @@ def test_a_uniform_block_is_uniform():
     assert result.best.values["E"] == pytest.approx(4e4, rel=0.1)
 
 
+def sampled(count, seed):
+    """The block with other particles."""
+    at = trimesh.transformations.translation_matrix([0.4, 0.08, 0.5])
+    mesh = trimesh.creation.box([0.24, 0.12, 0.24], at)
+    return block().resampled(torch.from_numpy(sample_volume(mesh, count, seed)), mesh.volume, 1000.0)
+
+
+def test_few_particles_are_no_field():
+    """The block of few particles fits better with a field. More particles do not agree with it, unless it is true."""
+    for seed in (1, 2):
+        few, many = sampled(300, seed), (sampled(1500, 100 + seed), sampled(1500, 200 + seed))
+        assert identified(None, bodies=(many[0], few, None)).best.family.field
+        result = identified(None, bodies=(many[0], few, many[1]))
+        assert result.best.family.name == "uniform" and result.material is None
+    ramp = {"name": "ramp", "ratio": 3.0}
+    many = sampled(1500, 100), sampled(1500, 200)
+    result = identified(ramp, bodies=(many[0], sampled(300, 0), many[1]))
+    assert result.best.family.name == "ramp"
+    assert result.best.values["ratio"] == pytest.approx(3.0, rel=0.15)
+
+
+def test_a_field_must_be_better_than_the_uniform_family_by_more_than_a_tie():
+    families = {name: Family(name, spec) for name, spec in FAMILIES.items()}
+
+    def selected(**scores):
+        fits = [
+            FamilyFit(families[name], families[name].guess, score=score) for name, score in scores.items()
+        ]
+        best, ties = select_family(fits, IdentifyConfig(tie=0.15))
+        return best.family.name, ties
+
+    assert selected(uniform=1.0, ramp=0.9, halves=1.1) == ("uniform", ["ramp"])
+    assert selected(uniform=1.0, ramp=0.8, halves=0.9) == ("ramp", ["halves"])
+    assert selected(uniform=math.inf, ramp=0.9) == ("ramp", [])
+    assert selected(uniform=1.0, ramp=math.inf) == ("uniform", [])
+
+
 def test_limits_of_families_with_fields():
     uniform, ramp, halves = (Family(name, spec) for name, spec in FAMILIES.items())
     assert ramp.constants == ("E", "nu", "ratio") and not ramp.flows
     assert ramp.contains(uniform) and halves.contains(uniform)
     assert not halves.contains(ramp) and not uniform.contains(ramp)
+    assert ramp.varies(uniform) and not ramp.varies(halves) and not uniform.varies(uniform)
+    flow = Family("flow", {**law("hencky", "viscous_flow", viscosity=50), "field": FAMILIES["ramp"]["field"]})
+    assert flow.contains(uniform) and not flow.varies(uniform)
     stiff = {"E": 1e12, "nu": 0.3}
     limits = [own.limited({**own.guess, **stiff}, MODEL, 1000.0)["E"] for own in (uniform, ramp)]
     assert limits[0] == limits[1]

@@ -403,6 +403,15 @@ class TestTruth:
         assert loaded.identify.refined_particles > 0
         refined = changed(dataset={"grid": 40}, random={"count": 0})
         assert refined.identify_of("BouncyBall") == refined.identify
+        ramp = {
+            "elasticity": {"name": "hencky", "E": 1e5, "nu": 0.3},
+            "field": {"name": "ramp", "ratio": 1.0},
+        }
+        uneven = changed(identify={"families": {"ramp": ramp}}, random={"count": 0})
+        with_field = uneven.identify_of("BouncyBall")
+        assert (
+            with_field.refinement == 1 and with_field.refined_particles == uneven.identify.refined_particles
+        )
 
     def test_the_converged_table_has_96_cells_and_is_optional(self, loaded, changed):
         table = loaded.tables["table1_converged"]
