@@ -21,15 +21,16 @@ RADIUS, SCALE = 0.03, 0.001  # [m], length of a pixel [m]
 FALL, STIFFNESS = 0.0734, 526.0  # 1.2 m/s and 12 ms of contact, flattened by 0.16 of the radius
 
 
-def bounce(rate, phase=0.0, stiffness=STIFFNESS, restitution=1.0, exposure=0.0):
+def bounce(rate, phase=0.0, stiffness=STIFFNESS, restitution=1.0, exposure=0.0, rows=150):
     """A ball filmed at (k + phase) / rate until it is high again. Blurred silhouettes are all places of an exposure."""
     times = (np.arange(round(0.24 * rate)) + phase) / rate
     y, v = hertz_motion(times, RADIUS, FALL, stiffness, restitution)
-    masks = np.zeros((len(times), 140, 100), bool)
+    masks = np.zeros((len(times), 150, 100), bool)
     for shift in np.linspace(-0.5, 0.5, 9 if exposure else 1):
         moved = hertz_motion(np.maximum(times + shift * exposure, 0), RADIUS, FALL, stiffness, restitution)[0]
-        masks |= [cut_disc((50.3, 139.6 - each / SCALE), RADIUS / SCALE, 139.6, (140, 100)) for each in moved]
-    flying = [np.flatnonzero((y > RADIUS) & way) for way in ((v <= 0) & (times < 0.15), v > 0)]
+        masks |= [cut_disc((50.3, 139.6 - each / SCALE), RADIUS / SCALE, 139.6, (150, 100)) for each in moved]
+    masks, seen = masks[:, :rows], y > max(RADIUS, (139.6 - rows) * SCALE + RADIUS)
+    flying = [np.flatnonzero(seen & way) for way in ((v <= 0) & (times < 0.15), v > 0)]
     return measure_bounce([rise(times, masks, k) for k in flying], flying, masks, times, SCALE, 0.0)
 
 
@@ -82,6 +83,12 @@ def test_a_stiff_ball_shows_a_lower_bound(rate, stiffness):
         low, middle, high = seen["modulus_per_density_m2_s2_band"]
         assert middle is high is None and 0 < low < stiffness
         assert seen["restitution_band"][1] == pytest.approx(0.75, abs=0.01)
+
+
+def test_the_border_of_the_picture_is_no_floor():
+    seen = bounce(240, rows=128)
+    low, middle, _ = seen["modulus_per_density_m2_s2_band"]
+    assert seen["frames_of_contact"] == 0 and middle is None and 0 < low < STIFFNESS
 
 
 def test_a_ball_that_is_too_small_has_no_constants():

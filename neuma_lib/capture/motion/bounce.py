@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import beta
 
-from neuma_lib.capture.masks.regions import centroid, radius_of
+from neuma_lib.capture.masks.regions import centroid, radius_of, whole
 
 HALF_CONTACT = 0.4 * float(beta(0.4, 0.5))
 """Time until the largest flattening, of flattening / speed: the integral I."""
@@ -86,11 +86,11 @@ def measure_bounce(
     # Blur adds half of the path during the exposure to the lower half of a silhouette.
     design = np.stack([np.ones_like(speeds), speeds / 2], axis=1)
     radius, exposure = map(float, np.linalg.lstsq(design, halves, rcond=None)[0])
-    if radius < MIN_RADIUS:
-        return None
     spread = max(float(np.std(halves - design @ (radius, exposure), ddof=2)), _MIN_SPREAD)
     radius_spread = spread * np.sqrt(np.linalg.inv(design.T @ design)[0, 0])
-    near = [k for k in range(flying[0][-1], flying[1][0] + 1) if masks[k].any()]
+    near = [k for k in range(flying[0][-1], flying[1][0] + 1) if whole(masks[k])]  # the border is no floor
+    if radius < MIN_RADIUS or not near:
+        return None
     low, high = np.array([ends(masks[k]) for k in near]).T
     free = np.maximum(*(r.state(times[near])[0] for r in flights)) - radius
     contact = (low > free + _SEEN * spread) & ~np.isin(near, np.concatenate(flying))
