@@ -59,7 +59,7 @@ def evaluate_prior(
 ) -> dict[str, float]:
     """Deviation of rollouts of a law from those of the analytic law, on unseen motions.
 
-    A launch that lands on an edge can amplify the deviation tenfold, so the mean of a few launches says little.
+    A launch that lands on an edge can amplify the deviation tenfold, so that the mean of three is mostly noise.
 
     Returns:
         Means over frames and motions of ``chamfer``, the squared nearest-neighbour distance summed over both directions
