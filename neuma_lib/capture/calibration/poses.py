@@ -183,9 +183,9 @@ def structure_from_motion(
 ) -> Poses:
     """Cameras and points from overlapping pictures, in a world of arbitrary scale and orientation.
 
-    COLMAP with SIFT features on the CPU, exhaustive matching and incremental mapping. Pictures are numbered before their
-    features are computed, and mapping uses one thread, because the order of pictures and sums changes the poses: the
-    same seed gives the same result.
+    COLMAP with SIFT features on the CPU, exhaustive matching and incremental mapping. Pictures are numbered before
+    their features are computed, and mapping uses one thread, because the order of pictures and sums changes the poses:
+    the same seed gives the same result.
 
     Args:
         pictures: name -> file, `<folder>/<group>/<file>` as written by `copy_pictures`.
