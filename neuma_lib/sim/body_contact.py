@@ -44,6 +44,8 @@ def body_functions(dtype: torch.dtype, GridConstants: type) -> SimpleNamespace:
 
     - ``change(c, pairs, grid, node)``: change of the velocity of a node by contact. ``pairs`` has a `bodies.pair_table`
       for each copy, shape (copies B, B + 1).
+    - ``exchange(c, pairs, grid, grid_v, node, other)``: the same for a pair of nodes at the same place, added to both
+      velocities after contact by one thread.
     - ``adjoint(c, pairs, grid, grad_grid, node, grad_before, grad_around)``: from the gradients of the velocities of
       all bodies after contact, sets those of the velocity before contact and of the mass at the node (grad_before), and
       of the gradient and mean of masses around it (grad_around).
@@ -159,6 +161,26 @@ def body_functions(dtype: torch.dtype, GridConstants: type) -> SimpleNamespace:
         return result
 
     @wp.func
+    def exchange(
+        c: GridConstants,
+        pairs: wp.array2d(dtype=real),
+        grid: wp.array(dtype=vec4),
+        grid_v: wp.array(dtype=vec4),
+        node: wp.int32,
+        other: wp.int32,
+    ):
+        m_a, m_b, count = grid[node][3], grid[other][3], c.n * c.n * c.n
+        if m_a > real(0.0) and m_b > real(0.0):
+            first = first_body(c, node)
+            row, a, b = first / count, (node - first) / count, (other - first) / count
+            around_a = pairs[row + a, c.bodies] * around(c, grid, node)
+            around_b = pairs[row + b, c.bodies] * around(c, grid, other)
+            v = velocity(c, grid, node) - velocity(c, grid, other)
+            j = jump(pairs[row + a, b], around_a, around_b, v) / total_mass(c, grid, first)
+            grid_v[node] = grid_v[node] + m_b * vec4(j[0], j[1], j[2], real(0.0))
+            grid_v[other] = grid_v[other] - m_a * vec4(j[0], j[1], j[2], real(0.0))
+
+    @wp.func
     def adjoint(
         c: GridConstants,
         pairs: wp.array2d(dtype=real),
@@ -219,4 +241,4 @@ def body_functions(dtype: torch.dtype, GridConstants: type) -> SimpleNamespace:
                         total += wp.dot(grad_around[other], filter(-i, -j, -k))
         return total
 
-    return SimpleNamespace(change=change, adjoint=adjoint, mass_gradient=mass_gradient)
+    return SimpleNamespace(change=change, exchange=exchange, adjoint=adjoint, mass_gradient=mass_gradient)

@@ -52,7 +52,7 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
     real, vec3, vec4, mat33, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.GridConstants
     obstacle_row = functions.obstacle_row
     forward, adjoint = forward_functions(dtype, clamps, False), adjoint_functions(dtype, clamps, bodies)
-    contact_change = body_functions(dtype, GridConstants).change if bodies else None
+    exchange = body_functions(dtype, GridConstants).exchange if bodies else None
     hold_mass, update_node, move_particle = forward.hold_mass, forward.update_node, forward.move_particle
     node_adjoint, deformation_adjoint = adjoint.node_adjoint, adjoint.deformation_adjoint
     moved_mask = functions.moved_mask
@@ -170,10 +170,13 @@ def transfer_kernels(dtype: torch.dtype, features: tuple[str, ...] = ()) -> Simp
         if wp.static(bodies):
             lines = c.n * c.n
             for row in range(c.fields * lines):
-                span = (row / lines * 6 + 4) * lines + row % lines
-                for node in range(row * c.n + spans[span], row * c.n + spans[span + lines] + 1):
-                    j = contact_change(c, pairs, grids[0], node)
-                    grids[1, node] = grids[1, node] + vec4(j[0], j[1], j[2], real(0.0))
+                span, body = (row / lines * 6 + 4) * lines + row % lines, row / lines % c.bodies
+                for later in range(1, c.bodies - body):  # where both have nodes
+                    theirs, away = span + 6 * later * lines, later * lines * c.n
+                    low = wp.max(spans[span], spans[theirs])
+                    high = wp.min(spans[span + lines], spans[theirs + lines])
+                    for node in range(row * c.n + low, row * c.n + high + 1):
+                        exchange(c, pairs, grids[0], grids[1], node, node + away)
 
     @kernel
     def g2p(c, now, after, cached, step, grids, mass_now, x, v, C, F, F_trial, faults):
