@@ -48,13 +48,7 @@ _BACKGROUND_FRAMES = 61
 _CONSTANTS = (  # of a ball: key of the report, name, limit, factor and unit on the page
     ("restitution_band", "restitution", 1.0, 1.0, ""),
     ("contact_s_band", "duration of contact", None, 1e3, " ms"),
-    (
-        "flattening_of_radius_band",
-        "flattening of the radius, by Hertz,",
-        0.2,
-        1.0,
-        "",
-    ),  # larger: no longer linear
+    ("flattening_of_radius_band", "flattening of the radius, by Hertz,", 0.2, 1.0, ""),
     ("modulus_per_density_m2_s2_band", "E / (1 - nu^2) for 1000 kg/m^3", None, 1e-3, " MPa"),
 )
 _SHAPE_FRAMES = 40  # at most, from which the shape is measured
@@ -177,12 +171,8 @@ def analyse_clip(video: str | Path, folder: str | Path, diameter: float | None =
     if shape:
         pages["Shape: silhouettes grey and blue, body of revolution grey and red"] = "shape.png"
     for k, (pair, rebound) in enumerate(zip(pairwise(flights), report["rebounds"]), start=1):
-        parts = (
-            [flight.rise(diameter) for flight in pair],
-            [flight.used for flight in pair],
-            result.masks,
-            times,
-        )
+        rises = [flight.rise(diameter) for flight in pair]
+        parts = rises, [flight.used for flight in pair], result.masks, times
         if shape and shape.report["ball"]:
             rebound["ball"] = measure_bounce(*parts, best["pixel_m"], best["pixel_deviation"])
         if rebound["ball"]:
@@ -249,12 +239,11 @@ def _shape(flights: Sequence[ClipFlight], masks: np.ndarray) -> Revolution | Non
     frames = np.concatenate([flight.used for flight in flights])
     velocities = np.concatenate([np.gradient(f.places, f.times, axis=0) for f in flights])
     speeds = np.linalg.norm(velocities, axis=1)
-    good = [whole(masks[k]) and radius_of(masks[k]) >= MIN_RADIUS for k in frames] & (
-        speeds <= np.median(speeds)
-    )
-    if good.sum() < 3:
+    large = np.array([whole(masks[k]) and radius_of(masks[k]) >= MIN_RADIUS for k in frames])
+    chosen = np.flatnonzero(large & (speeds <= np.median(speeds)))
+    if len(chosen) < 3:
         return None
-    chosen = np.flatnonzero(good)[:: -(-int(good.sum()) // _SHAPE_FRAMES)]
+    chosen = chosen[:: -(-len(chosen) // _SHAPE_FRAMES)]
     return fit_revolution(masks[frames[chosen]], velocities[chosen])
 
 
@@ -331,13 +320,8 @@ def _rebound_checks(rebound: dict[str, Any], name: str) -> list[Check]:
     result = []
     for key, what, limit, factor, unit in _CONSTANTS:
         low, middle, high = (value and factor * value for value in ball[key])
-        text = (
-            f"{middle:.3g} ({low:.3g} to {high:.3g})"
-            if middle
-            else f"> {low:.3g}"
-            if low
-            else f"< {high:.3g}"
-        )
+        text = f"> {low:.3g}" if low else f"< {high or 0:.3g}"
+        text = f"{middle:.3g} ({low:.3g} to {high:.3g})" if middle else text
         good = limit is None or (low or 0.0) < limit
         result.append(Check(f"{what} before {name}", text + unit, f"< {limit}" if limit else "", good))
     if largest := ball["largest_flattening_seen_m"]:
@@ -347,7 +331,7 @@ def _rebound_checks(rebound: dict[str, Any], name: str) -> list[Check]:
 
 
 def _draw_rebound(path: Path, ball: dict[str, Any], rises: list[Rise], flying: list, masks, times) -> None:
-    frames = [k for k in range(flying[0][-5], flying[1][4] + 1) if masks[k].any()]
+    frames = [k for k in range(flying[0][-5:][0], flying[1][:5][-1] + 1) if masks[k].any()]
     heights = np.array([ends(masks[k]) for k in frames]) - ball["floor_px"]
     t = np.linspace(times[frames[0]], times[frames[-1]], 200)
     figure = new_figure(9, 5)

@@ -80,8 +80,9 @@ def add_commands(commands: Any) -> None:
         commands,
         _clip,
         "clip: measure the flight of an object in one video",
-        "Measures gravity, spin and rebound in a video of a fixed camera, without photographs or calibration. Writes "
-        "clip.md, clip.json and pictures. Example: neuma clip ball.mp4 results/ball --diameter 0.067",
+        "Measures gravity, spin, rebound and shape, and the stiffness of a ball, in a video of a fixed camera, without "
+        "photographs or calibration. Writes clip.md, clip.json and pictures. Example: neuma clip ball.mp4 results/ball "
+        "--diameter 0.067",
         argument(
             "video", metavar="VIDEO", help="video of the flight, filmed from the side by a fixed camera"
         ),

@@ -21,13 +21,17 @@ RADIUS, SCALE = 0.03, 0.001  # [m], length of a pixel [m]
 FALL, STIFFNESS = 0.0734, 526.0  # 1.2 m/s and 12 ms of contact, flattened by 0.16 of the radius
 
 
-def bounce(rate, phase=0.0, stiffness=STIFFNESS, restitution=1.0):
-    """A ball filmed at (k + phase) / rate until it is high again."""
+def bounce(rate, phase=0.0, stiffness=STIFFNESS, restitution=1.0, exposure=0.0, rows=150):
+    """A ball filmed at (k + phase) / rate until it is high again. Blurred silhouettes are all places of an exposure."""
     times = (np.arange(round(0.24 * rate)) + phase) / rate
     y, v = hertz_motion(times, RADIUS, FALL, stiffness, restitution)
-    masks = [cut_disc((50.3, 139.6 - each / SCALE), RADIUS / SCALE, 139.6, (140, 100)) for each in y]
-    flying = [np.flatnonzero((y > RADIUS) & way) for way in ((v <= 0) & (times < 0.15), v > 0)]
-    return measure_bounce([rise(times, masks, k) for k in flying], flying, np.array(masks), times, SCALE, 0.0)
+    masks = np.zeros((len(times), 150, 100), bool)
+    for shift in np.linspace(-0.5, 0.5, 9 if exposure else 1):
+        moved = hertz_motion(np.maximum(times + shift * exposure, 0), RADIUS, FALL, stiffness, restitution)[0]
+        masks |= [cut_disc((50.3, 139.6 - each / SCALE), RADIUS / SCALE, 139.6, (150, 100)) for each in moved]
+    masks, seen = masks[:, :rows], y > max(RADIUS, (139.6 - rows) * SCALE + RADIUS)
+    flying = [np.flatnonzero(seen & way) for way in ((v <= 0) & (times < 0.15), v > 0)]
+    return measure_bounce([rise(times, masks, k) for k in flying], flying, masks, times, SCALE, 0.0)
 
 
 def test_the_ends_of_a_disc_are_those_that_were_drawn():
@@ -58,6 +62,20 @@ def test_a_soft_ball_filmed_at_240_a_second_shows_its_stiffness(restitution):
         assert 0.5 * flattening < seen["largest_flattening_seen_m"] < flattening
 
 
+@pytest.mark.parametrize(
+    ("rate", "exposure", "value"), [(240, 0.002, True), (120, 0.006, True), (60, 0.014, False)]
+)
+def test_an_exposure_longer_than_the_contact_leaves_a_bound(rate, exposure, value):
+    """Of 12 ms. Half of the exposure is the slope of a length over the speed, which changes by 1 m/s: 1 ms for half a
+    pixel. Of the blur next to the contact, the floor cuts a part.
+    """
+    seen = bounce(rate, 0.5, exposure=exposure)
+    assert seen["exposure_s"] == pytest.approx(exposure, abs=1e-3 + 0.1 * exposure)
+    low, _, high = seen["modulus_per_density_m2_s2_band"]
+    assert low < STIFFNESS and (high is not None) == value
+    assert not value or STIFFNESS < high
+
+
 @pytest.mark.parametrize(("rate", "stiffness"), [(60, 4e4), (240, 4e4), (240, 4e5)])
 def test_a_stiff_ball_shows_a_lower_bound(rate, stiffness):
     for phase in (0.0, 0.25, 0.5, 0.75):
@@ -65,6 +83,12 @@ def test_a_stiff_ball_shows_a_lower_bound(rate, stiffness):
         low, middle, high = seen["modulus_per_density_m2_s2_band"]
         assert middle is high is None and 0 < low < stiffness
         assert seen["restitution_band"][1] == pytest.approx(0.75, abs=0.01)
+
+
+def test_the_border_of_the_picture_is_no_floor():
+    seen = bounce(240, rows=128)
+    low, middle, _ = seen["modulus_per_density_m2_s2_band"]
+    assert seen["frames_of_contact"] == 0 and middle is None and 0 < low < STIFFNESS
 
 
 def test_a_ball_that_is_too_small_has_no_constants():

@@ -183,14 +183,15 @@ def structure_from_motion(
 ) -> Poses:
     """Cameras and points from overlapping pictures, in a world of arbitrary scale and orientation.
 
-    COLMAP with SIFT features on the CPU, exhaustive matching and incremental mapping. Features and mapping use one
-    thread, because the order of pictures and sums changes the poses: the same seed gives the same result.
+    COLMAP with SIFT features on the CPU, exhaustive matching and incremental mapping. Pictures are numbered before
+    their features are computed, and mapping uses one thread, because the order of pictures and sums changes the poses:
+    the same seed gives the same result.
 
     Args:
         pictures: name -> file, `<folder>/<group>/<file>` as written by `copy_pictures`.
         work: folder for COLMAP's files.
         seed: of all random numbers.
-        threads: for matching, which takes longest.
+        threads: for features and matching, which take longest.
         lenses: known lenses by group, kept fixed. Others are estimated.
 
     Raises:
@@ -213,7 +214,10 @@ def structure_from_motion(
     database.unlink(missing_ok=True)  # of an earlier run
     shutil.rmtree(models_folder, ignore_errors=True)
     models_folder.mkdir()
-    extraction = pycolmap.FeatureExtractionOptions(max_image_size=_LARGEST, num_threads=1, use_gpu=False)
+    pycolmap.Database.open(database).close()
+    extraction = pycolmap.FeatureExtractionOptions(
+        max_image_size=_LARGEST, num_threads=threads, use_gpu=False
+    )
     for group in dict.fromkeys(map(group_of, pictures)):
         reader = pycolmap.ImageReaderOptions(
             camera_model=PHOTOGRAPH_MODEL if group == PHOTOGRAPHS else STILL_MODEL
@@ -224,10 +228,12 @@ def structure_from_motion(
             # The denominator coefficients k4 to k6 are 0.
             values = [*lens.K[[0, 1], [0, 1]], *lens.K[:2, 2], *lens.distortion, 0, 0, 0]
             reader.camera_params = ",".join(repr(float(v)) for v in values)
+        names = [name for name in pictures if group_of(name) == group]
+        pycolmap.import_images(database, root, pycolmap.CameraMode.PER_FOLDER, names, reader)
         pycolmap.extract_features(
             database,
             root,
-            image_names=[name for name in pictures if group_of(name) == group],
+            image_names=names,
             camera_mode=pycolmap.CameraMode.PER_FOLDER,
             reader_options=reader,
             extraction_options=extraction,

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import beta
 
-from neuma_lib.capture.masks.regions import centroid, radius_of
+from neuma_lib.capture.masks.regions import centroid, radius_of, whole
 
 HALF_CONTACT = 0.4 * float(beta(0.4, 0.5))
 """Time until the largest flattening, of flattening / speed: the integral I."""
@@ -66,7 +66,7 @@ def measure_bounce(
     """Measure the contact between two flights of a ball. Bands are the 2.5th, 50th and 97.5th percentile.
 
     The duration has only an upper limit, and the stiffness a lower one, if no frame shows the contact, if a frame is
-    exposed for more than half of it, or if it is not known to a factor of two.
+    exposed for longer, or if it is not known to a factor of two.
 
     Args:
         flights: before and after contact.
@@ -86,15 +86,16 @@ def measure_bounce(
     # Blur adds half of the path during the exposure to the lower half of a silhouette.
     design = np.stack([np.ones_like(speeds), speeds / 2], axis=1)
     radius, exposure = map(float, np.linalg.lstsq(design, halves, rcond=None)[0])
-    if radius < MIN_RADIUS:
-        return None
     spread = max(float(np.std(halves - design @ (radius, exposure), ddof=2)), _MIN_SPREAD)
     radius_spread = spread * np.sqrt(np.linalg.inv(design.T @ design)[0, 0])
-    near = [k for k in range(flying[0][-1], flying[1][0] + 1) if masks[k].any()]
+    near = [k for k in range(flying[0][-1], flying[1][0] + 1) if whole(masks[k])]  # the border is no floor
+    if radius < MIN_RADIUS or not near:
+        return None
     low, high = np.array([ends(masks[k]) for k in near]).T
     free = np.maximum(*(r.state(times[near])[0] for r in flights)) - radius
     contact = (low > free + _SEEN * spread) & ~np.isin(near, np.concatenate(flying))
     seen = bool(contact.any())
+    flattening = max(0.0, *(2 * radius - high + low)[contact]) if seen else 0.0
     floor = float(np.median(low[contact]) if seen else low.min())
     touch = floor + rng.normal(radius, np.linalg.norm([spread, _FLAT, radius_spread]), _SAMPLES)
     with np.errstate(invalid="ignore"):
@@ -116,16 +117,14 @@ def measure_bounce(
     stiffness = 5 * np.pi / 4 * squared * np.maximum(relative, 1e-9) ** -2.5
     bands = (np.percentile(each[good], _BAND).tolist() for each in (ratio, duration, relative, stiffness))
     restitution, duration, relative, stiffness = bands
-    if not seen or duration[0] <= max(duration[1], exposure) / 2:
+    if not seen or duration[0] <= max(duration[1] / 2, exposure):
         duration[:2], relative[:2], stiffness[1:] = [None] * 2, [None] * 2, [None] * 2
     return {
         "radius_px": radius,
         "floor_px": floor,
         "exposure_s": max(0.0, exposure),
         "frames_of_contact": int(contact.sum()),
-        "largest_flattening_seen_m": scale * float((2 * radius - high + low)[contact].max())
-        if seen
-        else None,
+        "largest_flattening_seen_m": scale * float(flattening) or None,  # blur hides it
         "restitution_band": restitution,
         "contact_s_band": duration,
         "flattening_of_radius_band": relative,
