@@ -259,7 +259,9 @@ def _shape_report(shape: Revolution, pixel: float, folder: Path) -> dict[str, An
     if shape.report["agrees"]:
         write_mesh(folder / "shape.ply", mesh.vertices, mesh.faces)
     wide, _, length = np.ptp(mesh.vertices, axis=0).tolist()
-    return shape.report | {"diameter_m": wide, "length_m": length, "volume_m3": float(mesh.volume)}
+    # Edges are wrong by the tolerated distance on both sides where, say, a mask lacks the dark side of the object.
+    sizes = {"diameter_m": wide, "length_m": length, "tolerance_m": 2 * shape.report["limit_px"] * pixel}
+    return shape.report | sizes | {"volume_m3": float(mesh.volume)}
 
 
 def _rebound(before: ClipFlight, after: ClipFlight) -> dict[str, Any]:
@@ -298,7 +300,8 @@ def checks(report: dict[str, Any]) -> list[Check]:
             result.append(Check(f"spin in {name}", f"{size:.1f} +- {deviation:.1f} rad/s", "", True))
         result += _rebound_checks(report["rebounds"][k - 1], name) if k else []
     if shape := report["shape"]:
-        text = f"{1e3 * shape['diameter_m']:.1f} mm wide, {1e3 * shape['length_m']:.1f} mm along the axis"
+        wide, length, tolerance = (1e3 * shape[key] for key in ("diameter_m", "length_m", "tolerance_m"))
+        text = f"{wide:.1f} mm wide, {length:.1f} mm along the axis, +- {tolerance:.1f} mm"
         if shape["blur_px"] > 2 * shape["limit_px"]:
             text = f"none, since it is {shape['blur_px']:.0f} px longer along its motion, as by blur"
         elif not shape["agrees"]:
