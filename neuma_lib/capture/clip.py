@@ -259,7 +259,7 @@ def _shape_report(shape: Revolution, pixel: float, folder: Path) -> dict[str, An
     if shape.report["agrees"]:
         write_mesh(folder / "shape.ply", mesh.vertices, mesh.faces)
     wide, _, length = np.ptp(mesh.vertices, axis=0).tolist()
-    # Edges are wrong by the tolerated distance on both sides where, say, a mask lacks the dark side of the object.
+    # Edges are wrong by the tolerated distance on both sides, for example where a mask lacks the dark side.
     sizes = {"diameter_m": wide, "length_m": length, "tolerance_m": 2 * shape.report["limit_px"] * pixel}
     return shape.report | sizes | {"volume_m3": float(mesh.volume)}
 
