@@ -35,8 +35,9 @@ OTHERS = {
     "StVK + Drucker-Prager": law_spec("stvk", "drucker_prager", E=1e6, nu=0.2, friction_angle=25),
     "Hencky + viscous flow": law_spec("hencky", "viscous_flow", E=1e5, nu=0.4, viscosity=20.0),
 }
-ROUGH = {"sand", "StVK + Drucker-Prager"}
-"""Laws whose return map a network of the published size follows only roughly (docs/materials.md, Priors)."""
+ROUGH = {"sand": 0.02, "StVK + Drucker-Prager": 0.01}
+"""Laws whose return map a network of the published size follows only roughly (docs/materials.md, Priors), and the
+largest Chamfer distance of three launches by their elasticity alone [1e-4 m^2]."""
 LAWS = {"jelly": JELLY, "plasticine": PLASTICINE, "sand": SAND, "water": WATER, **OTHERS}
 TINY = RegressionConfig(
     throws=2, side_particles=4, grid=12, duration=0.15, samples=4096, iterations=500, batch=512, rounds=2
@@ -228,7 +229,7 @@ def test_a_rough_prior_is_called_rough_with_its_figure(chamfer, warns):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", sorted(LAWS.keys() - ROUGH))
+@pytest.mark.parametrize("name", sorted(LAWS.keys() - ROUGH.keys()))
 def test_default_settings_reach_the_released_priors(name):
     """Rollouts of priors trained by the authors differ from their laws by a Chamfer distance of 0.1 to 0.5e-4 m^2."""
     _, report = train_prior(LAWS[name], RegressionConfig())
@@ -238,7 +239,7 @@ def test_default_settings_reach_the_released_priors(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(ROUGH))
 def test_a_rough_prior_is_rough_by_its_return_map_alone(name):
-    """The elasticity has a quarter of the bound; the whole is as far as the authors' own priors, and warns."""
+    """The elasticity is well within the bound; the whole is as far as the authors' own priors, and warns."""
     settings = RegressionConfig()
     law, report = train_prior(LAWS[name], settings)
     reference = reference_law(LAWS[name], settings)
@@ -246,8 +247,9 @@ def test_a_rough_prior_is_rough_by_its_return_map_alone(name):
         "elasticity": Law(law.elasticity, reference.plasticity),
         "plasticity": Law(reference.elasticity, law.plasticity),
     }
-    parts = {part: evaluate_prior(each, LAWS[name], settings)["chamfer"] for part, each in parts.items()}
-    assert 4 * parts["elasticity"] < CLOSE < parts["plasticity"]
+    reports = {part: evaluate_prior(each, LAWS[name], settings, launches=3) for part, each in parts.items()}
+    elasticity, plasticity = (reports[part]["chamfer"] for part in ("elasticity", "plasticity"))
+    assert elasticity < ROUGH[name] < CLOSE < plasticity
     assert CLOSE <= report["chamfer"] < 0.5
     assert f"Chamfer {report['chamfer']:.4f}e-4 m^2. WARNING" in remark(report)
 
