@@ -1,5 +1,6 @@
 """Files and settings of captures (docs/capture.md). Needs scenes.smk."""
 
+from dataclasses import replace
 from functools import cache
 
 from neuma_lib.config.variants import NAME, RESERVED
@@ -16,6 +17,7 @@ OF_VIDEOS = (
     "density",
     "dt",
     "held_out",
+    "bodies",
     "duration",
     "frames",
     "width",
@@ -28,9 +30,10 @@ VIDEO_FRAMES = f"{RESULTS}/{{capture}}/frames/{VIDEO}"
 FLIGHT = f"{RESULTS}/{{capture}}/flight/{{take}}"
 
 # Names of folders with other results.
-OTHERS = "|".join([TRUE_SCENE, PILE_SCENE, SPLAT_SCENE, *RESERVED])
+OTHERS = "|".join([TRUE_SCENE, DRAWN_PILE, SPLAT_SCENE, *RESERVED])
 RELEASED_CAPTURE = names_of(SETTINGS.captures.released, replicates=False)
 OWN_CAPTURE = f"(?!({OTHERS}|{RELEASED_CAPTURE})/){NAME.pattern}"
+WHOLE_CAPTURE = f"(?!{CAPTURED_PART}/){OWN_CAPTURE}"
 RELEASED_TAKE = scenes_that(
     lambda scene: scene.captured and scene.captured.capture in SETTINGS.captures.released, replicates=False
 )
@@ -47,6 +50,9 @@ wildcard_constraints:
 def capture_named(name):
     if name in SETTINGS.captures.released:
         return released_captures({name: SETTINGS.captures.released[name]})[name]
+    if name in SETTINGS.scenes and SETTINGS.scenes[name].part_of:
+        whole, body = SETTINGS.scenes[name].part_of
+        return replace(capture_named(whole), body=body)
     return PLANNED.get(name) or read_capture(f"{CAPTURES}/{name}")
 
 
@@ -74,8 +80,33 @@ def of_video(choose):
 
 
 def captured_file(pattern):
-    """A function of wildcards: a file of their capture or take."""
-    return of_take(lambda capture, take: pattern.format(capture=capture.folder.name, take=take))
+    """A function of wildcards: a file of their capture or take, or of the room that all bodies of a capture share."""
+    return of_take(
+        lambda capture, take: pattern.format(
+            capture=capture.name, take=take, room=capture.folder.name, source=photographed(capture)
+        )
+    )
+
+
+def photographed(capture):
+    """Name of the scene with the photographs of a capture, or of one of its bodies."""
+    name, where = capture.source, f"{capture.folder / 'capture.yaml'}: bodies.{capture.body}.capture"
+    if name not in SETTINGS.scenes or SETTINGS.scenes[name].bodies and capture.body:
+        raise InputError(where, f"no capture '{name}' of one body", "Name a folder of captures")
+    scales = SETTINGS.scenes[name].captured.scale, capture.settings.scale
+    if scales[0] != scales[1]:
+        raise InputError(where, f"the scale of '{name}' is {scales[0]:g}, but {scales[1]:g} here", "Set one scale")
+    return name
+
+
+def of_take_bodies(pattern):
+    """A function of wildcards: a file of each body of their take, or of the take itself where it is of one."""
+    return of_take(
+        lambda capture, take: [
+            pattern.format(capture=name, take=take)
+            for name in [f"{capture.folder.name}_{body}" for body in capture.labels] or [capture.name]
+        ]
+    )
 
 
 def of_take_cameras(pattern):
@@ -89,7 +120,7 @@ def of_videos(pattern):
 
 
 def video_files(pattern, capture, takes):
-    name = capture.folder.name
+    name = capture.name
     return [
         pattern.format(capture=name, take=take, camera=camera)
         for take in takes
@@ -100,7 +131,7 @@ def video_files(pattern, capture, takes):
 def of_takes(pattern):
     """A function of wildcards: a file for each take of their capture."""
     return of_capture(
-        lambda capture: [pattern.format(capture=capture.folder.name, take=take) for take in capture.takes]
+        lambda capture: [pattern.format(capture=capture.name, take=take) for take in capture.takes]
     )
 
 
@@ -137,7 +168,7 @@ def videos_of(capture):
 def saliency_network(capture):
     """The network, if a photograph has no mask of the user."""
     own = capture.own_masks("photographs")
-    return [] if all(p.stem in own for p in capture.photographs) else [f"{DATA}/weights/u2netp.onnx"]
+    return [] if capture.labels or all(p.stem in own for p in capture.photographs) else [f"{DATA}/weights/u2netp.onnx"]
 
 
 def marked_photographs(capture):

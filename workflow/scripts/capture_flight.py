@@ -33,7 +33,7 @@ def main(inputs, output, params, run) -> None:
     with evidence(output.picture, lambda path: draw_tracks(path, views, params.name)):
         cues = read_cues(read_json(room)["up"]) if room else ()
         flight = find_flight(views, params.name, params.metric, cues)
-        if room and flight.agreement is not None:
+        if room and flight.agreement is not None and not params.hidden:
             check_one_object(flight.agreement, params.cameras, params.name)
         if room and not params.metric:
             centres = read_json(room)["centres_m"]

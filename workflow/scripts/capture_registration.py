@@ -26,6 +26,7 @@ KNOWN_SPIN = 3.0
 
 def main(inputs, output, params, run) -> None:
     flight, gaussians = read_json(inputs.flight), load_gaussians(inputs.gaussians)
+    flights = [read_json(file) for file in listed(inputs.flights)]  # of all bodies
     x, vol0, _ = load_particles(inputs.particles)
     files = zip(
         params.cameras,
@@ -48,6 +49,7 @@ def main(inputs, output, params, run) -> None:
         scale_known,
         run.progress,
         floor=float(world.get("offset", [0.0, 0.0, 0.0])[1]),
+        start=max(each["start_s"] for each in flights) if len(flights) > 1 else None,
     )
     gravity = Gravity(
         registered.gravity / scale,

@@ -62,8 +62,8 @@ def main(inputs, output, params, run) -> None:
     with evidence(output.sheet, draw_frames):
         if own:
             files = {int(stem): file for stem, file in own.items()}
-            masks = np.stack([own_mask(files[n], lens, params.longest) for n in numbers])
-            result = given_masks(masks, timeline.times[numbers], down)
+            labels = np.stack([own_mask(files[n], lens, params.longest, params.labels) for n in numbers])
+            result = given_masks(_of_body(labels, params), timeline.times[numbers], down)
         else:
             result = video_masks(pictures, inputs.video, background, timeline.times[numbers], down=down)
     masks, areas = result.masks, result.areas
@@ -92,7 +92,7 @@ def main(inputs, output, params, run) -> None:
         (
             {**still, "file_path": f"{number:05d}.png", "step": number, "time": time},
             pixels,
-            masks[k],
+            labels[k] if params.labels and params.body is None else masks[k],
         )
         for k in visible
         for number, time, pixels in [frame(k)]
@@ -144,6 +144,17 @@ def _search(video, timeline, lens, background, down, params, output) -> tuple[np
     with evidence(output, lambda path: contact_sheet(path, [first, *sheet[::2]], text)):
         shift = check_fixed(list(shifts.values()), list(shifts), longest, video)
     return timeline.numbers[window], shift
+
+
+def _of_body(labels, params) -> np.ndarray:
+    """Masks (T, H, W) of the object, or of one of several bodies. Raises InputError if no frame shows it."""
+    if params.body is None:
+        return labels > 0
+    masks = labels == 1 + list(params.labels).index(params.body)
+    if not masks.any():
+        problem = f"no mask has the label {params.labels[params.body]} of {params.body}"
+        raise InputError(params.name, problem, "Correct the masks, or `bodies` in capture.yaml")
+    return masks
 
 
 def _named(own, count) -> np.ndarray:
