@@ -101,7 +101,8 @@ def world(points):
 @pytest.mark.slow
 def test_drawn_bodies_are_reconstructed_placed_and_identified(project):
     identify = {"families": {"soft": {"elasticity": {"name": "neo_hookean", "E": 1e5, "nu": 0.3}}}}
-    project.run(*overlay(identify=identify), f"{TAKE}/identified.json")
+    gaussians = {"iterations": 300, "initial_count": 600, "hull_resolution": 32}
+    project.run(*overlay(identify=identify, gaussians=gaussians), f"{TAKE}/identified.json")
     root = project.root
     for name, radii in RADII.items():
         mesh = read_mesh(root / f"{PILE}_{name}/mesh.ply")

@@ -91,11 +91,15 @@ def captured_file(pattern):
 def photographed(capture):
     """Name of the scene with the photographs of a capture, or of one of its bodies."""
     name, where = capture.source, f"{capture.folder / 'capture.yaml'}: bodies.{capture.body}.capture"
-    if name not in SETTINGS.scenes or SETTINGS.scenes[name].bodies and capture.body:
+    if capture.body is None:
+        return name
+    if name not in SETTINGS.scenes or SETTINGS.scenes[name].bodies or not SETTINGS.scenes[name].captured:
         raise InputError(where, f"no capture '{name}' of one body", "Name a folder of captures")
     scales = SETTINGS.scenes[name].captured.scale, capture.settings.scale
     if scales[0] != scales[1]:
-        raise InputError(where, f"the scale of '{name}' is {scales[0]:g}, but {scales[1]:g} here", "Set one scale")
+        raise InputError(
+            where, f"the scale of '{name}' is {scales[0]:g}, but {scales[1]:g} here", "Set one scale"
+        )
     return name
 
 
@@ -168,7 +172,11 @@ def videos_of(capture):
 def saliency_network(capture):
     """The network, if a photograph has no mask of the user."""
     own = capture.own_masks("photographs")
-    return [] if capture.labels or all(p.stem in own for p in capture.photographs) else [f"{DATA}/weights/u2netp.onnx"]
+    return (
+        []
+        if capture.labels or all(p.stem in own for p in capture.photographs)
+        else [f"{DATA}/weights/u2netp.onnx"]
+    )
 
 
 def marked_photographs(capture):

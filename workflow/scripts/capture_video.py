@@ -35,12 +35,12 @@ def main(inputs, output, params, run) -> None:
     for view, (camera, transforms, timeline, row_time, exposure) in enumerate(files):
         data, images = read_transforms(transforms), read_image_set(transforms).images
         labels = read_labels(transforms) if len(registrations) > 1 else None
-        offset = np.mean([each["offsets_s"][camera] - each["t0_s"] for each in registrations])
+        surest = min(registrations, key=lambda each: each["offsets_std_s"][camera])
         gain = np.mean([each["gains"][camera] for each in registrations], axis=0)
         frames = data["frames"]
         rows = np.array([np.flatnonzero(image[..., 3].any(axis=1)).mean() + 0.5 for image in images])
         times = frame_times(frames, rows, row_time, read_json(timeline)["height"])
-        times += offset
+        times += surest["offsets_s"][camera] - surest["t0_s"]
         chosen = chosen_frames(times, params.duration, params.frames, f"{params.name}, {camera}")
         for k in chosen:
             pixels = reduced(without_gain(images[k], gain), params.width)

@@ -96,24 +96,26 @@ def write_mattes(
     path: str | Path,
     mattes: Iterable[tuple[dict[str, Any], np.ndarray, np.ndarray]],
     world: Mapping[str, Any],
+    body: int | None = None,
 ) -> None:
     """Write a transforms.json and the RGBA pictures that it lists.
 
     Args:
         path: .../transforms.json.
         mattes: entry with the ``file_path`` to write to, pixels (H, W, 3), uint8, and mask (H, W) of each picture. A
-            mask with numbers of bodies is written as well.
+            mask with numbers of bodies is written as well (`neuma_lib.io.images.read_labels`).
         world: entries of the file that describe the world of its cameras, see `world_of`.
+        body: number of the body that the pictures show (`neuma_lib.io.images.read_hidden`). None: all.
     """
     folder = Path(path).parent
     folder.mkdir(parents=True, exist_ok=True)
     Path(path).unlink(missing_ok=True)  # a folder without it is incomplete
     frames = []
     for frame, pixels, mask in mattes:
-        rgba = matted(pixels, mask > 0)
+        rgba = matted(pixels, mask == body if body else mask > 0)
         rgba[rgba[..., 3] == 0] = 0  # compresses better
         write_png(folder / frame["file_path"], rgba)
         if mask.dtype != bool:
             frame = {**frame, "label_path": write_labels(folder, frame["file_path"], mask)}
         frames.append({key: value for key, value in frame.items() if key != "sha256"})
-    write_transforms(path, {}, frames, **world)
+    write_transforms(path, {}, frames, **world, **({"body": body} if body else {}))
