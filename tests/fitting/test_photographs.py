@@ -130,11 +130,11 @@ def test_a_body_hidden_by_another_is_not_left_out(duck, tmp_path):
     views = load_static(tmp_path / "own/transforms.json", PhotographsConfig(margin=0.05))
     assert views.left_out == ()
     for k, (image, hidden) in enumerate(zip(views.images, views.hidden, strict=True)):
-        shown = image[..., 3] > 0.5
-        assert hidden.shape == shown.shape and not (hidden & shown).any()
+        visible = image[..., 3] > 0.5
+        assert hidden.shape == visible.shape and not (hidden & visible).any()
         assert bool(hidden.any()) == (k % 4 == 0)
         whole = images[k][..., 3] > 0.5
-        assert (hidden | shown).sum() == whole.sum()
+        assert (hidden | visible).sum() == whole.sum()
     others = read_json(tmp_path / "own/transforms.json")
     del others["body"]
     write_json(tmp_path / "own/unknown.json", others)

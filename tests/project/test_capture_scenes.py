@@ -11,6 +11,7 @@ from neuma_lib.capture.motion.synchronisation import (
     frame_times,
     reduced,
     reduced_intrinsics,
+    reduced_labels,
     without_gain,
 )
 from neuma_lib.config.capture import ReleasedConfig
@@ -227,6 +228,19 @@ def test_reduced_pictures_keep_coverage_and_colour_and_nothing_of_the_background
     assert (small[small[..., 3] > 0][:, :3] == (200, 100, 50)).all()
     assert not small[small[..., 3] == 0].any()
     assert reduced(rgba, 100) is rgba
+
+
+def test_reduced_labels_are_those_of_the_largest_share():
+    """Of blocks of 4 x 4 pixels. A block that bodies cover by less than half has none."""
+    labels = np.zeros((8, 12), np.uint8)
+    labels[:4, :4] = 2
+    labels[:4, :1] = 1
+    labels[:4, 4:7], labels[:2, 4:7] = 1, 3
+    labels[2:4, 5:7] = 3
+    labels[4:, :1] = 2
+    labels[4:, 4:5], labels[4:, 5:6] = 1, 2
+    labels[4:6, 6:7] = 2
+    np.testing.assert_array_equal(reduced_labels(labels, (3, 2), 3), [[2, 3, 0], [0, 2, 0]])
 
 
 def test_a_point_stays_on_its_part_of_a_reduced_picture():
