@@ -223,14 +223,12 @@ class ReleasedConfig(Section):
         description="metres per unit of the files, which are not metric: free fall is 1.33 times too fast. "
         "`flight/first.json` has the value that the frames before contact give",
     )
-    enlarge: float = Field(
-        2.5,
-        gt=0,
-        description="metres of the simulator per metre, `scale` in capture.yaml; for objects of 10 cm",
+    enlarge: float = internal(
+        2.5, "metres of the simulator per metre, `scale` in capture.yaml; for objects of 10 cm", gt=0
     )
     contact: int | None = internal(None, "frame of the first contact; null: from the files, or 5", ge=5)
     prior: str = Field("jelly", description="as in capture.yaml")
-    density: float = Field(1000.0, gt=0, description="as in capture.yaml [kg/m^3]")
+    density: float = internal(1000.0, "as in capture.yaml [kg/m^3]", gt=0)
     dt: float = internal(1 / 1920, "time step [s], a sixteenth of a frame of 1/120 s", gt=0, lt=0.01)
     grid: int | None = internal(None, "as in capture.yaml", ge=8)
     longest: int = internal(1000, "longer side of the stored photographs [px]", ge=64, le=8192)

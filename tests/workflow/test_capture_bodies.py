@@ -125,7 +125,7 @@ def test_drawn_bodies_are_reconstructed_placed_and_identified(project):
     gaussians = {"iterations": 300, "initial_count": 600, "hull_resolution": 32}
     changes = overlay(identify=identify, gaussians=gaussians)
     videos = [f"tiny/data/pile_first{part}/dynamic/transforms.json" for part in ("", "_clay", "_gum")]
-    project.run(*changes, f"{TAKE}/identified.json", *videos)
+    project.run(*changes, f"{TAKE}/identified.json", f"{PILE}/motion.md", *videos)
     root = project.root
     for name, radii in RADII.items():
         mesh = read_mesh(root / f"{PILE}_{name}/mesh.ply")
@@ -143,6 +143,8 @@ def test_drawn_bodies_are_reconstructed_placed_and_identified(project):
     labels = read_labels(root / videos[0])
     assert len(labels) == len(whole["frames"]) and {*np.unique(labels)} == {0, 1, 2}
     assert [part["body"] for part in parts] == [1, 2]
+    page = (root / PILE / "motion.md").read_text()
+    assert "flight in first, clay" in page and "(../pile_gum/flight/first.png)" in page
     identified = read_json(root / f"{TAKE}/identified.json")
     assert list(identified["bodies"]) == ["clay", "gum"]
     (pair,) = identified["pairs"]

@@ -26,7 +26,7 @@ rule capture_photograph_masks:
         report=f"{RESULTS}/{{capture}}/masks/photographs.json",
         sheet=f"{RESULTS}/{{capture}}/masks/photographs.png",
     wildcard_constraints:
-        capture=WHOLE_CAPTURE,
+        capture=OWN_CAPTURE,
     conda:
         CAPTURE_ENVIRONMENT
     params:
@@ -54,7 +54,7 @@ rule capture_video_masks:
         report=f"{VIDEO_MASKS}.json",
         sheet=f"{VIDEO_MASKS}.png",
     wildcard_constraints:
-        capture=OWN_CAPTURE,
+        capture=FILMED_CAPTURE,
     conda:
         CAPTURE_ENVIRONMENT
     resources:
@@ -81,7 +81,7 @@ rule capture_flight:
         flight=f"{FLIGHT}.json",
         picture=f"{FLIGHT}.png",
     wildcard_constraints:
-        capture=OWN_CAPTURE,
+        capture=FILMED_CAPTURE,
     conda:
         CAPTURE_ENVIRONMENT
     params:
@@ -98,15 +98,15 @@ rule capture_motion_page:
     input:
         photographs=f"{RESULTS}/{{capture}}/masks/photographs.json",
         photograph_sheet=f"{RESULTS}/{{capture}}/masks/photographs.png",
-        reports=of_videos(f"{VIDEO_MASKS}.json"),
-        sheets=of_videos(f"{VIDEO_MASKS}.png"),
+        reports=of_body_videos(f"{VIDEO_MASKS}.json"),
+        sheets=of_body_videos(f"{VIDEO_MASKS}.png"),
         flights=of_takes(f"{FLIGHT}.json"),
         pictures=of_takes(f"{FLIGHT}.png"),
     output:
         page=f"{RESULTS}/{{capture}}/motion.md",
     params:
         title="{capture}: masks and free flight",
-        videos=of_capture(videos_of),
-        takes=of_capture(lambda capture: list(capture.takes)),
+        videos=of_capture(body_videos_of),
+        takes=of_capture(take_titles),
     script:
         "../scripts/capture_motion_page.py"

@@ -32,8 +32,8 @@ FLIGHT = f"{RESULTS}/{{capture}}/flight/{{take}}"
 # Names of folders with other results.
 OTHERS = "|".join([TRUE_SCENE, DRAWN_PILE, SPLAT_SCENE, *RESERVED])
 RELEASED_CAPTURE = names_of(SETTINGS.captures.released, replicates=False)
-OWN_CAPTURE = f"(?!({OTHERS}|{RELEASED_CAPTURE})/){NAME.pattern}"
-WHOLE_CAPTURE = f"(?!{CAPTURED_PART}/){OWN_CAPTURE}"
+FILMED_CAPTURE = f"(?!({OTHERS}|{RELEASED_CAPTURE})/){NAME.pattern}"  # or one of its bodies
+OWN_CAPTURE = f"(?!{CAPTURED_PART}/){FILMED_CAPTURE}"
 RELEASED_TAKE = scenes_that(
     lambda scene: scene.captured and scene.captured.capture in SETTINGS.captures.released, replicates=False
 )
@@ -103,12 +103,23 @@ def photographed(capture):
     return name
 
 
+def parts_of(capture):
+    """The bodies of a capture as captures, or the capture of one body itself."""
+    return [replace(capture, body=body) for body in capture.labels] or [capture]
+
+
 def of_take_bodies(pattern):
-    """A function of wildcards: a file of each body of their take, or of the take itself where it is of one."""
+    """A function of wildcards: a file of each body of their take."""
     return of_take(
-        lambda capture, take: [
-            pattern.format(capture=name, take=take)
-            for name in [f"{capture.folder.name}_{body}" for body in capture.labels] or [capture.name]
+        lambda capture, take: [pattern.format(capture=part.name, take=take) for part in parts_of(capture)]
+    )
+
+
+def of_body_videos(pattern):
+    """A function of wildcards: a file for each body in each video of their capture."""
+    return of_capture(
+        lambda capture: [
+            file for part in parts_of(capture) for file in video_files(pattern, part, part.takes)
         ]
     )
 
@@ -133,10 +144,19 @@ def video_files(pattern, capture, takes):
 
 
 def of_takes(pattern):
-    """A function of wildcards: a file for each take of their capture."""
+    """A function of wildcards: a file for each take of their capture, or for each body in it."""
     return of_capture(
-        lambda capture: [pattern.format(capture=capture.name, take=take) for take in capture.takes]
+        lambda capture: [
+            pattern.format(capture=part.name, take=take) for part in parts_of(capture) for take in part.takes
+        ]
     )
+
+
+def take_titles(capture):
+    """Names of takes, in the order of `of_takes`."""
+    return [
+        take + (f", {part.body}" if part.body else "") for part in parts_of(capture) for take in part.takes
+    ]
 
 
 def capture_setting(name):
@@ -167,6 +187,12 @@ def capture_file(capture, name):
 def videos_of(capture):
     """Take and camera of all videos."""
     return [(take, camera) for take, cameras in capture.takes.items() for camera in cameras]
+
+
+def body_videos_of(capture):
+    """Take, with the body, and camera of all videos, in the order of `of_body_videos`."""
+    titled = zip(take_titles(capture), [take for _ in parts_of(capture) for take in capture.takes])
+    return [(title, camera) for title, take in titled for camera in capture.takes[take]]
 
 
 def saliency_network(capture):
