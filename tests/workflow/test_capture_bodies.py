@@ -84,10 +84,11 @@ def project(tmp_path, kernels, drawn):
 
 
 def test_labelled_bodies_enter_the_rules_of_several_bodies(project):
-    plan = project.plan(f"{TAKE}/identified.json")
+    plan = project.plan(f"{TAKE}/constants/rollout.h5")
     counts = {"capture_photograph_masks": 1, "gaussians_of_bodies": 1, "capture_video_masks": 6}
     counts |= {rule: 2 for rule in ("body_gaussians", "body_static", "mesh", "binding")}
     counts |= {"capture_flight": 2, "capture_registration": 2, "capture_video": 1, "identify_bodies": 1}
+    counts |= {"experiment_start": 1, "predict": 1}
     assert {rule: plan[rule] for rule in counts} == counts
     assert plan["capture_poses"] == plan["capture_room"] == 1 and not plan["velocity_of_bodies"]
 
@@ -123,9 +124,9 @@ def test_drawn_bodies_are_reconstructed_placed_and_identified(project):
     """The bodies touch in the photographs. One hides half of the other from one camera in flight."""
     identify = {"families": {"soft": {"elasticity": {"name": "neo_hookean", "E": 1e5, "nu": 0.3}}}}
     gaussians = {"iterations": 300, "initial_count": 600, "hull_resolution": 32}
-    changes = overlay(identify=identify, gaussians=gaussians)
+    changes = overlay(identify=identify, gaussians=gaussians, viewer={"methods": ["constants"]})
     videos = [f"tiny/data/pile_first{part}/dynamic/transforms.json" for part in ("", "_clay", "_gum")]
-    project.run(*changes, f"{TAKE}/identified.json", f"{PILE}/motion.md", *videos)
+    project.run(*changes, f"{TAKE}/viewer.html", f"{PILE}/motion.md", *videos)
     root = project.root
     for name, radii in RADII.items():
         mesh = read_mesh(root / f"{PILE}_{name}/mesh.ply")
@@ -149,6 +150,9 @@ def test_drawn_bodies_are_reconstructed_placed_and_identified(project):
     assert list(identified["bodies"]) == ["clay", "gum"]
     (pair,) = identified["pairs"]
     assert pair["log_std"] > 1  # they do not touch
+    assert read_json(root / f"{TAKE}/constants/prediction.json")["stable"]
+    names = (root / TAKE / "viewer.html").read_text()
+    assert '"clay"' in names and '"gum"' in names
     assert identified["hidden"]["clay"][0] > 0.1 > identified["hidden"]["gum"][0]
     for file in (root / "captures/pile/masks/first/left").iterdir():
         pixels = np.asarray(Image.open(file))

@@ -90,7 +90,7 @@ rule predict:
     params:
         method=of_bodies(model_parameter),
         simulation=simulation_settings,
-        densities=of_case(lambda case: [case.density(case.moved)]),
+        densities=of_bodies(lambda bodies: [case.density(case.moved) for case in bodies]),
         total=of_bodies(carries_total),
         particle_source=of_bodies(shared_particle_source),
         frames=None,

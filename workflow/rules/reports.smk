@@ -33,6 +33,8 @@ def take_run(name, take, method):
 @checked
 def capture_start(wildcards):
     """File of the initial motion of a take: of the method, or of the free flight where the take is held out."""
+    if SETTINGS.scene(wildcards.scene).bodies:
+        return evaluated_start(wildcards)
     captured = SETTINGS.scene(wildcards.scene).captured
     if captured.throw in capture_named(captured.capture).settings.held_out:
         return of_replicate("velocity.json")(wildcards)
