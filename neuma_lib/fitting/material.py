@@ -34,7 +34,7 @@ from neuma_lib.fitting.training_loop import TrainingLoop
 from neuma_lib.geometry.chamfer import chamfer_loss
 from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.mechanics.law import Law
-from neuma_lib.sim.model import MPM
+from neuma_lib.sim.model import MPM, MaterialRegion
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State, Trajectory
 from neuma_lib.splatting.observation import (
@@ -242,6 +242,15 @@ def weighted_mean(losses: Tensor, iteration: int, settings: TrainingConfig) -> T
     return (weights * losses).sum() / weights.sum()
 
 
+Surrounded = Callable[[Law], Law | Sequence[MaterialRegion]]
+"""The laws of all particles, from that of the body in training."""
+
+
+def alone(law: Law) -> Law:
+    """`Surrounded` for one body."""
+    return law
+
+
 def train_material(
     model: MPM,
     law: Law,
@@ -254,6 +263,7 @@ def train_material(
     checkpoint: Checkpoint | None = None,
     progress: Callable[[int, int, float], None] | None = None,
     log: Callable[[str], None] = print,
+    surrounded: Surrounded = alone,
 ) -> TrainedMaterial:
     """Optimise the trainable parameters of a law so that rollouts match the frames of a video.
 
@@ -268,6 +278,7 @@ def train_material(
         checkpoint: file for the state of the loop, so that an interrupted run can resume; None for none.
         progress: called with (iteration, iterations, loss).
         log: receives a line for every recovery from a diverging step.
+        surrounded: the laws of all particles of a start, from that of the body in training.
 
     Raises:
         NonFiniteError: the first rollout is not finite, so there is no state to return to.
@@ -279,7 +290,7 @@ def train_material(
     if not stretch.before:
         model.check_courant(law, min(float(start.density.min()) for start, _ in videos))
     law.set_adjoint_precision(settings.adjoint_precision)
-    loop = _Loop(model, law, videos, settings, log, stretch)
+    loop = _Loop(model, law, videos, settings, log, stretch, surrounded)
     loop.run(checkpoint, progress)
     law.load_state_dict(loop.best["law"])
     return TrainedMaterial(
@@ -297,7 +308,8 @@ class _Loop(TrainingLoop):
 
     NAME = "material"
 
-    def __init__(self, model, law, videos, settings, log, stretch):
+    def __init__(self, model, law, videos, settings, log, stretch, surrounded):
+        self.surrounded = surrounded
         self.model, self.law, self.videos, self.before = model, law, videos, stretch.before
         self.model_parts = {"law": law}
         whole = stretch.before + settings.iterations + stretch.after
@@ -361,7 +373,7 @@ class _Loop(TrainingLoop):
         memory = None if self.settings.memory is None else self.settings.memory * 2**30 / len(self.videos)
         return rollout(
             self.model,
-            self.law,
+            self.surrounded(self.law),
             start,
             steps=loss.steps[-1],
             frames=loss.steps,

@@ -24,10 +24,19 @@ from neuma_lib.config.structured import StructuredConfig
 from neuma_lib.config.training import TrainingConfig
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.fitting.frame_batches import first_contact, held_out_frames
-from neuma_lib.fitting.material import History, Stretch, TrainedMaterial, TrajectoryLoss, train_material
+from neuma_lib.fitting.material import (
+    History,
+    Stretch,
+    Surrounded,
+    TrainedMaterial,
+    TrajectoryLoss,
+    alone,
+    train_material,
+)
 from neuma_lib.io.checkpoint import Checkpoint
+from neuma_lib.mechanics.law import Law
 from neuma_lib.mechanics.structured import StructuredLaw
-from neuma_lib.sim.model import MPM
+from neuma_lib.sim.model import MPM, MaterialRegion
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State, Trajectory
 
@@ -105,11 +114,12 @@ def train_structured(
     checkpoint: Checkpoint | None = None,
     progress: Callable[[int, int, float], None] | None = None,
     log: Callable[[str], None] = print,
+    surrounded: Surrounded = alone,
 ) -> tuple[TrainedMaterial, Selection]:
     """Select the parts of a law to correct, and train them in place.
 
     Args:
-        model, start, loss, settings, other_videos: as in `train_material`.
+        model, start, loss, settings, other_videos, surrounded: as in `train_material`.
         law: analytic law with an adaptor that is zero.
         structured: settings of the selection.
         rivals: laws of other families, one of which replaces ``law`` if its correction has a lower held-out loss.
@@ -128,13 +138,13 @@ def train_structured(
         )
     laws = [law, *rivals]
     uncorrected = [copy.deepcopy(each.state_dict()) for each in laws]
-    simulated = [_simulate(model, law, *video) for video in videos]
+    simulated = [_simulate(model, surrounded(law), *video) for video in videos]
     if any(result is None for result in simulated):
         raise NonFiniteError("material", "the simulation with the uncorrected law diverges")
     paths = [path for path, _ in simulated]
     firsts = [  # a simulation that starts later would have moving obstacles at other times
         0
-        if model.changes
+        if model.changes or own.bodies  # several may touch each other before the obstacles
         else first_informative_frame(
             len(loss.frames), first_contact(model, path.at(loss.frames).x, own.vol0, loss.frames)
         )
@@ -172,12 +182,14 @@ def train_structured(
         inner = checkpoint and _Stage(checkpoint, _plain(trials), dict(states))
         overall = progress and (lambda done, _, value: progress(before + done, total, value))
         options = {"other_videos": videos[1:], "checkpoint": inner, "progress": overall, "log": log}
-        return train_material(model, law, *videos[0], settings, stretch=stretch, **options)
+        return train_material(
+            model, law, *videos[0], settings, stretch=stretch, surrounded=surrounded, **options
+        )
 
     def evaluate(name: str, base: int, state: LawState) -> None:
         """Store the score of a law on the informative frames."""
         laws[base].load_state_dict(state)
-        results = [_simulate(model, laws[base], *video) for video in informative]
+        results = [_simulate(model, surrounded(laws[base]), *video) for video in informative]
         trials[name] = Score(math.inf, math.inf)
         if all(results):
             means = (
@@ -296,7 +308,7 @@ def _flow(law: Mapping[str, Any]) -> str:
 
 
 def _simulate(
-    model: MPM, law: StructuredLaw, start: State, loss: TrajectoryLoss
+    model: MPM, law: Law | Sequence[MaterialRegion], start: State, loss: TrajectoryLoss
 ) -> tuple[Trajectory, list[float]] | None:
     """The motion at all steps of a loss, and the losses of its frames; None if it diverges."""
     with torch.no_grad():

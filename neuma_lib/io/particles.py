@@ -110,6 +110,15 @@ def with_motion(body: Reconstruction, velocity: str | Path) -> State:
     return body.state(*(motion[key] for key in INITIAL_MOTION))
 
 
+def with_motions(bodies: Sequence[Reconstruction], velocity: str | Path) -> State:
+    """State of bodies that touch each other with the motions of the identified.json of all."""
+    parts = _initial_motion(velocity)["bodies"]
+    own = [
+        body.state(*(part[key] for key in INITIAL_MOTION)) for body, part in zip(bodies, parts, strict=True)
+    ]
+    return State.joined(own, separate=True)
+
+
 def load_initial_state(
     particles: str | Path,
     binding: str | Path,

@@ -126,6 +126,13 @@ class Case(ABC):
         """Name of the file of the law identified in the views of `options`."""
 
     @abstractmethod
+    def with_others(self) -> tuple[Case, dict[str, Case]]:
+        """The same on the scene of several bodies that this one is of, and on the scene of each of them by name.
+
+        Raises InputError if there is none.
+        """
+
+    @abstractmethod
     def each_video(self, choose: Callable[[Case], str]) -> str | list[str]:
         """A path of the scene of each video: one path, or a list if a scene has several videos."""
 
@@ -351,10 +358,12 @@ class Method(ABC):
         return load_module(self.draws_module).draws(inputs, law, F, uncertainty, **drawn)
 
 
+BODY = {"particles": "particles.h5", "binding": "binding.h5", "gaussians": "gaussians.ply"}
+
+
 def body_of_each_video(case: Case) -> Files:
     """The reconstructed body of each video of a scene: particles, binding and Gaussians."""
-    names = {"particles": "particles.h5", "binding": "binding.h5", "gaussians": "gaussians.ply"}
-    return {name: case.each_video(lambda each, file=file: each.result(file)) for name, file in names.items()}
+    return {name: case.each_video(lambda each, file=file: each.result(file)) for name, file in BODY.items()}
 
 
 def friction_options(case: Case) -> dict[str, Any]:

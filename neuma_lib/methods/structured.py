@@ -6,6 +6,7 @@ from neuma_lib.config.training import TrainingConfig
 from neuma_lib.errors import InputError
 from neuma_lib.methods.base import (
     AS_IDENTIFIED,
+    BODY,
     Case,
     Files,
     Method,
@@ -45,6 +46,16 @@ class Structured(Method):
     }
 
     def fit_inputs(self, case: Case) -> Files:
+        if case.options.corrected is not None:
+            whole, bodies = self._corrected(case)
+            if bodies[case.options.corrected].scene != case.scene:
+                raise InputError(
+                    f"{case.name} on {case.scene}", "another body is corrected", "Take its scene"
+                )
+            identified = whole.result("identified.json")
+            files = {name: [each.result(file) for each in bodies.values()] for name, file in BODY.items()}
+            video = {"transforms": whole.data("dynamic/transforms.json")}
+            return {**files, **video, "velocity": identified, "identified": identified}
         base = {"identified": case.result(case.identified())} if case.prior == IDENTIFIED else {}
         return training_inputs(case) | base
 
@@ -52,9 +63,16 @@ class Structured(Method):
         return {"base": self._base(case), **super().fit_options(case)}
 
     def model_inputs(self, case: Case) -> Files:
+        if case.options.corrected is not None:
+            whole, bodies = self._corrected(case)
+            adaptor = bodies[case.options.corrected].product()
+            return {"adaptor": adaptor, "identified": whole.result("identified.json")}
         return {"adaptor": case.product()}
 
     def model_options(self, case: Case) -> dict:
+        if case.options.corrected is not None:
+            body = case.together[1] if case.together else case.options.corrected
+            return {"body": body, "corrected": case.options.corrected}
         return friction_options(case) if case.prior == IDENTIFIED else {}
 
     def seeds(self, case: Case) -> tuple[str, ...]:
@@ -66,15 +84,20 @@ class Structured(Method):
         from neuma_lib.fitting.structured_fit import rival_bases, train_structured
         from neuma_lib.io.files import read_json
         from neuma_lib.io.laws import save_adaptor
+        from neuma_lib.mechanics.analytic import analytic_law
         from neuma_lib.mechanics.structured import structured_law
         from neuma_lib.methods.training import Training
+        from neuma_lib.sim.bodies import Pair
+        from neuma_lib.sim.model import consecutive
 
         options = dict(options)
         base = options.pop("base")
         settings = StructuredOptions(**options)
-        bases, identified = [base], {}
+        bases, identified, together = [base], {}, {}
         if not base:
             identified = read_json(inputs["identified"])
+            if settings.corrected is not None:
+                together, identified = identified, identified["bodies"][settings.corrected]
             bases = [identified["law"], *rival_bases(identified, settings.rivals)]
         laws = [
             structured_law({**each, "form": settings.form}, problem.simulation["dt"], seed=settings.seed)
@@ -84,9 +107,28 @@ class Structured(Method):
         for law in laws:
             law.attach_adaptor(settings.rank, settings.alpha, settings.seed)
         friction = recorded_friction(identified)
-        training = Training(inputs, options, settings, problem, run, {"base": base}, friction)
+        names = list(together.get("bodies", ()))
+        pairs = tuple(
+            Pair(*sorted(map(names.index, pair["bodies"])), pair["friction"])
+            for pair in together.get("pairs", ())
+        )
+        training = Training(inputs, options, settings, problem, run, {"base": base}, friction, pairs)
+        others = {
+            name: analytic_law(together["bodies"][name]["law"], problem.simulation["dt"]).to(run.device)
+            for name in names
+        }
+
+        def surrounded(law):
+            if not together:
+                return law
+            return consecutive([*(others | {settings.corrected: law}).values()], training.counts)
+
         trained, chosen = train_structured(
-            *training.problem(laws[0]), settings, rivals=laws[1:], **training.options()
+            *training.problem(laws[0]),
+            settings,
+            rivals=laws[1:],
+            surrounded=surrounded,
+            **training.options(),
         )
         run.log(chosen.summary())
         training.write_history(trained, chosen.as_dict())
@@ -103,16 +145,34 @@ class Structured(Method):
         from neuma_lib.fitting.identified import recorded_friction
         from neuma_lib.io.laws import load_law
         from neuma_lib.io.weights import read_weights
+        from neuma_lib.methods.constants import Constants
         from neuma_lib.methods.model import LawOnGrid
 
+        corrected = options.get("corrected")
+        options = {key: value for key, value in options.items() if key != "corrected"}
+        if corrected is not None:
+            identified = Constants().load(inputs, options, dt)
+            if options["body"] != corrected:
+                return identified
+            options["pairs"] = identified.pairs
         about = read_weights(inputs["adaptor"])[1]
         law, friction = load_law(None, inputs["adaptor"], dt), recorded_friction(about)
         return LawOnGrid(law, stable=about["stable"], friction=friction, **options)
 
     def uncertainty_inputs(self, case: Case) -> Files:
-        if case.prior != IDENTIFIED:
+        if case.prior != IDENTIFIED or case.options.corrected is not None:
             return {}
         return {"identified": case.result(case.identified()), "rollout": case.rollout()}
+
+    @staticmethod
+    def _corrected(case: Case) -> tuple[Case, dict[str, Case]]:
+        """`Case.with_others` with the corrected body. Raises InputError if it is none of them."""
+        whole, bodies = case.with_others()
+        if case.prior != IDENTIFIED or case.options.corrected not in bodies:
+            problem = f"corrected = {case.options.corrected} with the prior {case.prior}"
+            remedy = f"Give one of {', '.join(bodies)}, and the prior {IDENTIFIED}"
+            raise InputError(f"{case.name} on {case.scene}", problem, remedy)
+        return whole, bodies
 
     def _base(self, case: Case) -> dict | None:
         """The analytic law of the prior, or None for the law identified in the video."""

@@ -1,22 +1,24 @@
 """Training of `neuma` and `structured`: bodies, initial states and losses of all videos, and the report."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import torch
 
 from neuma_lib.config.training import TrainingConfig
+from neuma_lib.coupling.bodies import join
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.fitting.frame_batches import check_contact
 from neuma_lib.fitting.material import ParticleLoss, PixelLoss
 from neuma_lib.io.files import listed, write_json
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.images import load_videos
-from neuma_lib.io.particles import load_reconstruction, with_motion
+from neuma_lib.io.particles import load_reconstruction, with_motion, with_motions
 from neuma_lib.io.simulator import simulator
 from neuma_lib.mechanics.adaptor import AdaptableLaw
 from neuma_lib.methods.base import Files, FitRun, Problem
+from neuma_lib.sim.bodies import Pair
 from neuma_lib.splatting.observation import Observation
 
 
@@ -29,6 +31,7 @@ class Training:
         settings: the same, validated.
         stamp: additional settings that a checkpoint must agree with.
         friction: Coulomb coefficient of all obstacles. None: those of the problem.
+        pairs: friction of bodies that touch each other. All bodies of the inputs are then in one video.
     """
 
     def __init__(
@@ -40,10 +43,12 @@ class Training:
         run: FitRun,
         stamp: Mapping[str, Any] | None = None,
         friction: float | None = None,
+        pairs: tuple[Pair, ...] = (),
     ):
         self.settings, self.run, self._problem = settings, run, problem
         mpm = simulator(problem.simulation)
-        self._mpm = mpm if friction is None else mpm.with_friction(friction)
+        mpm = mpm if friction is None else mpm.with_friction(friction)
+        self._mpm = replace(mpm, pairs=pairs)
         parts = zip(*(listed(inputs[name]) for name in ("particles", "binding", "gaussians")), strict=True)
         bodies = [
             load_reconstruction(*files, density, settings.particle_source, settings.gaussian_motion).to(
@@ -51,9 +56,13 @@ class Training:
             )
             for files, density in zip(parts, problem.densities, strict=True)
         ]
-        self.starts = [
-            with_motion(body, f) for body, f in zip(bodies, listed(inputs["velocity"]), strict=True)
-        ]
+        self.counts = [len(body.x0) for body in bodies]
+        if pairs:
+            self.starts, bodies = [with_motions(bodies, inputs["velocity"])], [join(bodies)]
+        else:
+            self.starts = [
+                with_motion(body, f) for body, f in zip(bodies, listed(inputs["velocity"]), strict=True)
+            ]
         if settings.supervision == "particles":
             self.losses = [particle_loss(file, run.device) for file in listed(inputs["truth"])]
         else:

@@ -82,6 +82,15 @@ class ProjectCase(Case):
             return "identified.json"
         return f"identified+views={','.join(map(str, views))}.json"
 
+    def with_others(self) -> tuple[Case, dict[str, Case]]:
+        base, seeds = self.settings.replicate(self.scene)
+        if (part := self.settings.scenes[base].part_of) is None:
+            problem = "it is none of several bodies in one video"
+            raise InputError(f"{self.scene}/{self.name}", problem, "Leave out `corrected`")
+        whole = replicate_folder(part[0], seeds)
+        scenes = zip(self.settings.scenes[part[0]].bodies, self.settings.body_scenes(whole), strict=True)
+        return replace(self, scene=whole), {name: replace(self, scene=scene) for name, scene in scenes}
+
     def each_video(self, choose: Callable[[Case], str]) -> str | list[str]:
         scenes = self.settings.video_scenes(self.scene)
         own, *others = (self.settings.obstacles(scene) for scene in scenes)
@@ -107,7 +116,9 @@ class ProjectCase(Case):
 
     @property
     def densities(self) -> list[float | dict[str, Any]]:
-        """The same for the bodies of all videos of a fit."""
+        """The same for all bodies of a fit."""
+        if getattr(self.options, "corrected", None):
+            return [self.density(each.scene) for each in self.with_others()[1].values()]
         return [self.density(scene) for scene in self.settings.video_scenes(self.scene)]
 
     @property

@@ -53,7 +53,9 @@ def scene_files(settings: Config, scene: str, methods: Sequence[str]) -> SceneFi
         simulation={"dt": chosen.dt, **constants},
         density=chosen.plain()["density"],
         **{name.partition(".")[0]: paths.result_path(settings, scene, name) for name in names},
-        truth=f"{data}/{base}/truth.h5" if chosen.has_truth or chosen.bodies and not chosen.captured else None,
+        truth=f"{data}/{base}/truth.h5"
+        if chosen.has_truth or chosen.bodies and not chosen.captured
+        else None,
         transforms=None if chosen.splat else f"{data}/{base}/dynamic/transforms.json",
         runs=runs,
         roots=(results, data),

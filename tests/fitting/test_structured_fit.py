@@ -8,6 +8,7 @@ import torch
 
 from neuma_lib.config.structured import StructuredConfig
 from neuma_lib.config.training import TrainingConfig
+from neuma_lib.coupling.bodies import join
 from neuma_lib.fitting.frame_batches import first_contact, held_out_frames
 from neuma_lib.fitting.material import ParticleLoss, PixelLoss, Stretch, train_material
 from neuma_lib.fitting.structured_fit import (
@@ -19,11 +20,16 @@ from neuma_lib.fitting.structured_fit import (
     subsets,
     train_structured,
 )
+from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.structured import structured_law
+from neuma_lib.sim.bodies import Pair
 from neuma_lib.sim.colliders import Collider
+from neuma_lib.sim.model import consecutive
 from neuma_lib.sim.rollout import rollout
+from neuma_lib.sim.state import State
+from neuma_lib.splatting.observation import Observation
 from tests.support.errors import refused
-from tests.support.grounding_scene import MODEL, TRUTH, ball, observe
+from tests.support.grounding_scene import MODEL, TRUTH, ball, block, camera, observe
 from tests.support.training import MemoryCheckpoint
 
 FRAMES = (0, 50, 60, 70, 80, 90, 100, 110)  # it touches the ground at about 50
@@ -347,3 +353,58 @@ def test_too_few_frames(problem):
     body, loss = problem
     with refused("frames"):
         fit((body, loss.select([0, 1, 2])), TRUTH)
+
+
+@pytest.fixture(scope="module")
+def next_to_a_block():
+    """A ball that falls on a sliding block, whose law is known: model, start, loss, and the laws from the ball's."""
+    bodies, counts = [block(), ball(height=0.33)], [300, 300]
+    velocities = [(0.8, -0.4, 0.0), (0.0, -1.5, 0.0)]
+    start = State.joined([body.state(v) for body, v in zip(bodies, velocities, strict=True)], separate=True)
+    model, frames = replace(MODEL, pairs=(Pair(0, 1, 0.3),)), tuple(range(0, 121, 12))
+    known = analytic_law({"elasticity": {"name": "hencky", "E": 1e5, "nu": 0.3}}, model.dt)
+    true, cameras = analytic_law(TRUTH, model.dt), camera()
+
+    def surrounded(law):
+        return consecutive([known, law], counts)
+
+    with torch.no_grad():
+        path = rollout(model, surrounded(true), start, steps=frames[-1], frames=frames)
+        images = join(bodies).particle_gs(cameras)(path.x, path.F)
+    return model, start, PixelLoss(join(bodies), Observation(frames, images, cameras)), surrounded
+
+
+def test_one_body_is_corrected_next_to_another(next_to_a_block):
+    """The ball touches the block only, so that its frames before the block touches the floor are not left out."""
+    model, start, loss, surrounded = next_to_a_block
+    law = structured_law(FLOWS, MODEL.dt).double()
+    law.attach_adaptor(rank=None)
+    options = {"surrounded": surrounded, "log": lambda _: None}
+    trained, choice = train_structured(model, law, start, loss, SETTINGS, STRUCTURED, **options)
+    assert choice.parts == ("elastic",)
+    assert choice.trials["elastic"].held_out_loss < 0.9 * choice.trials["nothing"].held_out_loss
+    assert trained.best_loss < 0.9 * trained.history.loss[0]
+    assert any(bool(p.any()) for p in deltas(trained.law, "elasticity"))
+    assert len(choice.held_out_frames[0]) == 2 and choice.held_out_frames[0][-1] == 120
+
+
+def test_slope_of_a_law_next_to_another_is_that_of_differences(next_to_a_block):
+    model, start, loss, surrounded = next_to_a_block
+    law = structured_law(FLOWS, MODEL.dt).double()
+    law.attach_adaptor(rank=None)
+    weights = [p for p in law.parts["elasticity"].adaptor.parameters()]
+    generator = torch.Generator().manual_seed(1)
+    along = [torch.randn(p.shape, generator=generator, dtype=p.dtype) for p in weights]
+
+    def value(step):
+        with torch.no_grad():
+            for p, direction in zip(weights, along, strict=True):
+                p.copy_(step * direction)
+        path = rollout(model, surrounded(law), start, steps=loss.steps[-1], frames=loss.steps)
+        return loss(path).mean()
+
+    value(0.05).backward()
+    slope = sum(float((p.grad * direction).sum()) for p, direction in zip(weights, along, strict=True))
+    with torch.no_grad():
+        difference = float(value(0.05 + 1e-5) - value(0.05 - 1e-5)) / 2e-5
+    assert abs(difference) > 1e-5 and slope == pytest.approx(difference, rel=1e-3)

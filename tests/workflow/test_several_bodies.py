@@ -71,6 +71,28 @@ def test_a_pile_has_no_fit_of_one_law(project):
     assert "Pile_fish, Pile_duck, Pile_ball" in refused and "Traceback (most recent call last)" not in refused
 
 
+def test_the_law_of_one_body_is_corrected_in_the_video_of_all(project):
+    """With the identified laws of the others, in the fit and in the prediction."""
+    method = "neuma_structured+corrected=duck"
+    plan = project.plan(*CHANGES, f"{RESULTS}/Pile/{method}/metrics.json")
+    fit, evaluated = plan.one("fit_structured"), plan.one("evaluate")
+    product, identified = (
+        f"{RESULTS}/Pile_duck/{method}/adaptor.safetensors",
+        f"{RESULTS}/Pile/identified.json",
+    )
+    assert fit.outputs[0] == product
+    particles = {f"{RESULTS}/Pile_{name}/particles.h5" for name in NAMES}
+    assert {f"{DATA}/Pile/dynamic/transforms.json", identified, *particles} <= {*fit.inputs}
+    assert {product, identified} <= {*evaluated.inputs} and not plan["identify"]
+    for scene, body, problem in (
+        ("Pile_fish", "duck", "another body is corrected"),
+        ("Pile_fish", "cat", "Give one of fish, duck, ball"),
+        ("BouncyBall", "duck", "none of several bodies"),
+    ):
+        target = f"{RESULTS}/{scene}/neuma_structured+corrected={body}/adaptor.safetensors"
+        assert problem in project.run("--dry-run", *CHANGES, target, succeeds=False)
+
+
 TOUCHING = {"duck": {"height": 0.4265}, "ball": {"height": 0.4265, "center": [0.6745, 0.5]}}
 """Duck on the fish, and ball at the duck, 0.2 mm apart."""
 
