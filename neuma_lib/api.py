@@ -277,11 +277,8 @@ def identify(
     }
     settings = validate(IdentifyConfig, values, "options")
     if settings.refined_particles:
-        raise InputError(
-            "options.refined_particles",
-            f"{settings.refined_particles} must be 0",
-            "Use the workflow to correct it",
-        )
+        problem = f"{settings.refined_particles} must be 0"
+        raise InputError("options.refined_particles", problem, "Use the workflow to correct it")
     body = replace(scene.reconstruction, affine=settings.gaussian_motion == "affine")
     video = _video(scene)
     motion = scene.motion or estimate_motion(body, video, scene.mpm)

@@ -50,11 +50,8 @@ def refuse_unknown(
         tried = dict.fromkeys("/".join(parts) for parts in islice(product(*options), _TRIED))
         near = [path for path in tried if exists(path)][:3]
         if missing := settings_of(target):
-            raise InputError(
-                target,
-                "no rule makes this file with these settings",
-                f"Add --configfile {' '.join(missing)} --",
-            )
+            problem = "no rule makes this file with these settings"
+            raise InputError(target, problem, f"Add --configfile {' '.join(missing)} --")
         if odd := [part for part in Path(target).parts[1:-1] if not _PLAIN.fullmatch(part)]:
             raise InputError(
                 target,

@@ -199,11 +199,8 @@ def _of_method(options: argparse.Namespace) -> tuple[Law, dict[str, Any]]:
     from neuma_lib.project.project import Project
 
     if options.adaptor or options.dt is not None:
-        raise InputError(
-            options.source,
-            "it is a method's folder, whose adaptor and time step are known",
-            "Leave out --adaptor and --dt",
-        )
+        problem = "it is a method's folder, whose adaptor and time step are known"
+        raise InputError(options.source, problem, "Leave out --adaptor and --dt")
     place = Path(options.source).absolute()
     settings, root = Project.find(place, options.configfile)
     settings = settings.model_copy(update={"results_root": str(place.parent.parent)})

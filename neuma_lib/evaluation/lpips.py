@@ -57,11 +57,8 @@ class LPIPS(nn.Module):
         for name, shape in expected_shapes(net).items():
             if name not in weights or tuple(weights[name].shape) != shape:
                 shape_here = tuple(weights[name].shape) if name in weights else "missing"
-                raise InputError(
-                    "LPIPS weights",
-                    f"{name} is {shape_here}, expected {shape}",
-                    "Build the file again with the rule lpips_weights",
-                )
+                problem = f"{name} is {shape_here}, expected {shape}"
+                raise InputError("LPIPS weights", problem, "Build the file again with the rule lpips_weights")
             self.register_buffer(name.replace(".", "_"), weights[name].float(), persistent=False)
 
     def features(self, images: Tensor) -> list[Tensor]:

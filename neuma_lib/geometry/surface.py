@@ -133,11 +133,8 @@ def photographed(mesh: trimesh.Trimesh, edge: float, floor: float | None) -> tri
     lower, upper = body.bounds
     if (lower < 0).any() or (upper > BOX_SIDE).any():
         extent = ", ".join(f"{axis} {a:.2f} to {b:.2f}" for axis, a, b in zip("xyz", lower, upper))
-        raise InputError(
-            "surface",
-            f"the body ({extent} m) exceeds the simulator's box, 0 to {BOX_SIDE:g} m along each axis",
-            "Correct `center`, or reduce `scale`, in capture.yaml",
-        )
+        problem = f"the body ({extent} m) exceeds the simulator's box, 0 to {BOX_SIDE:g} m along each axis"
+        raise InputError("surface", problem, "Correct `center`, or reduce `scale`, in capture.yaml")
     return body
 
 

@@ -33,11 +33,8 @@ class Capture:
     def pictures(self) -> dict[str, tuple[Path, ...]]:
         """Photographs and stills, by group. Raises InputError if photographs, or the still of a camera, are missing."""
         if not self.photographs:
-            raise InputError(
-                self.folder / self.settings.photographs,
-                f"no photographs ({', '.join(PICTURES)})",
-                "Put them there",
-            )
+            problem = f"no photographs ({', '.join(PICTURES)})"
+            raise InputError(self.folder / self.settings.photographs, problem, "Put them there")
         filmed = {camera for videos in self.takes.values() for camera in videos}
         for camera in sorted(filmed - self.stills.keys()):
             raise InputError(
@@ -130,11 +127,8 @@ def read_capture(folder: str | Path) -> Capture:
             )
     for name in (*cameras, *takes):
         if not NAME.fullmatch(name):
-            raise InputError(
-                folder,
-                f"'{one_line(name)}' cannot name folders and results",
-                "Rename it, with letters, digits, - and _",
-            )
+            problem = f"'{one_line(name)}' cannot name folders and results"
+            raise InputError(folder, problem, "Rename it, with letters, digits, - and _")
     if PHOTOGRAPHS in cameras:
         raise InputError(folder, f"a video camera cannot be named '{PHOTOGRAPHS}'", "Rename its files")
     names = [file.name for file in photographs]

@@ -330,9 +330,6 @@ def _condition(condition: Condition, contact: str) -> Condition:
         raise InputError("boundary", f"the Coulomb coefficient {condition!r} must be a number of at least 0")
     if contact != "particles":
         remedy = f"Use {', '.join(CONDITIONS)}, or contact of particles"
-        raise InputError(
-            "boundary",
-            f"the Coulomb coefficient {condition:g} needs contact of particles, not of {contact}",
-            remedy,
-        )
+        problem = f"the Coulomb coefficient {condition:g} needs contact of particles, not of {contact}"
+        raise InputError("boundary", problem, remedy)
     return _NAMED.get(condition, float(condition))

@@ -249,11 +249,8 @@ def board_pose(detection: Detection, board: BoardConfig, lens: Lens, where: str)
             best = pose, error
     if best is None or not best[1] < _MAX_PIXELS:
         error = f" (error {best[1]:.1f} px, limit {_MAX_PIXELS:g} px)" if best else ""
-        raise InputError(
-            where,
-            f"the corners do not fit a flat board seen from above{error}",
-            "Check board.squares, the lens, and that the print lies flat",
-        )
+        problem = f"the corners do not fit a flat board seen from above{error}"
+        raise InputError(where, problem, "Check board.squares, the lens, and that the print lies flat")
     return best
 
 

@@ -470,11 +470,8 @@ def poses_from_board(
             poses.append(pose)
             errors.append(error)
     if not names:
-        raise InputError(
-            "board",
-            f"none of {len(detections)} pictures shows the board",
-            "Lay it uncovered next to the object",
-        )
+        problem = f"none of {len(detections)} pictures shows the board"
+        raise InputError("board", problem, "Lay it uncovered next to the object")
     placed = Poses(
         tuple(names),
         tuple(lenses[group_of(name)] for name in names),

@@ -204,11 +204,8 @@ def _metres_per_unit(
             lenses.append(lens)
     required = min(2, len(length.ends))
     if len(views) < required:
-        raise InputError(
-            "length.ends",
-            f"{len(views)} of the marked photographs were registered, at least {required} must be",
-            "Mark the points in other photographs",
-        )
+        problem = f"{len(views)} of the marked photographs were registered, at least {required} must be"
+        raise InputError("length.ends", problem, "Mark the points in other photographs")
 
     def metres_per_unit(shift: np.ndarray) -> float:
         seen = [lens.directions(mark + by) for lens, mark, by in zip(lenses, marks, shift)]

@@ -132,20 +132,14 @@ def choose_family(
     """
     families, name = settings.families, settings.family
     if prior is None and (name is None or settings.guesses == "prior"):
-        raise InputError(
-            "pac_nerf.family",
-            "it cannot be selected because the scene's prior is a file, not an analytic law",
-            "Set pac_nerf.family, and pac_nerf.guesses to stock",
-        )
+        problem = "it cannot be selected because the scene's prior is a file, not an analytic law"
+        raise InputError("pac_nerf.family", problem, "Set pac_nerf.family, and pac_nerf.guesses to stock")
     if name is None:
         plasticity = prior["plasticity"]["name"]
         matching = [key for key, family in families.items() if family.plasticity.name == plasticity]
         if not matching:
-            raise InputError(
-                "pac_nerf.families",
-                f"none has the return map {plasticity} of the scene's prior",
-                "Add one, or set pac_nerf.family",
-            )
+            problem = f"none has the return map {plasticity} of the scene's prior"
+            raise InputError("pac_nerf.families", problem, "Add one, or set pac_nerf.family")
         name = matching[0]
     if name not in families:
         raise InputError("pac_nerf.family", f"{name!r} must be one of {', '.join(families)}")
