@@ -22,13 +22,7 @@ import numpy as np
 
 from benchmarks.timing import parser_of
 from neuma_lib.errors import InputError
-from neuma_lib.evaluation.calibration import (
-    FILE,
-    LEVELS,
-    QUANTITIES,
-    Quantiles,
-    family_probabilities,
-)
+from neuma_lib.evaluation.calibration import FILE, LEVELS, QUANTITIES, Quantiles, family_probabilities
 from neuma_lib.evaluation.coverage import brier_score, mean_over_scenes
 from neuma_lib.io.files import read_json, write_json
 from neuma_lib.paper.calibration_table import TARGETS, errors_in_std

@@ -48,10 +48,7 @@ IDENTIFYING = {
     "linearising": (FamilyRun, "linearise"),
     "uncertainties": (FamilyRun, "_covariance"),
 }
-CORRECTING = {
-    "training": (structured_fit, "train_material"),
-    "scoring": (structured_fit, "_simulate"),
-}
+CORRECTING = {"training": (structured_fit, "train_material"), "scoring": (structured_fit, "_simulate")}
 
 
 class Clock:

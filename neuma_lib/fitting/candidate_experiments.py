@@ -185,12 +185,7 @@ def _launch(
 
 
 def _press(
-    model: MPM,
-    body: Reconstruction,
-    motion: InitialMotion,
-    after: float,
-    lab: NextConfig,
-    draw: np.ndarray,
+    model: MPM, body: Reconstruction, motion: InitialMotion, after: float, lab: NextConfig, draw: np.ndarray
 ) -> Start | str:
     """A press of a body that is let go just above the floor, by a platen that moves down and up again."""
     size = _size(body)
@@ -244,12 +239,7 @@ def _landing(
 
 
 def _hang(
-    model: MPM,
-    body: Reconstruction,
-    motion: InitialMotion,
-    after: float,
-    lab: NextConfig,
-    draw: np.ndarray,
+    model: MPM, body: Reconstruction, motion: InitialMotion, after: float, lab: NextConfig, draw: np.ndarray
 ) -> Start | str:
     """A hang from a clamp around the upper part of the body, which moves to and fro and may then let go."""
     size = _size(body)

@@ -37,13 +37,7 @@ from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.model import MPM
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State, Trajectory
-from neuma_lib.splatting.observation import (
-    Observation,
-    joint_frames,
-    rendered_steps,
-    select_frames,
-    several,
-)
+from neuma_lib.splatting.observation import Observation, joint_frames, rendered_steps, select_frames, several
 
 
 class TrajectoryLoss(Protocol):

@@ -44,13 +44,7 @@ from neuma_lib.sim.model import MPM, contact_clearance
 from neuma_lib.sim.rigid_flight import rigid_flight
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State, cross_matrix
-from neuma_lib.splatting.observation import (
-    Observation,
-    joint_frames,
-    rendered_steps,
-    select_frames,
-    several,
-)
+from neuma_lib.splatting.observation import Observation, joint_frames, rendered_steps, select_frames, several
 
 NUISANCE_SCALE = 0.02
 """Unit of the constant shift [m] and of the relative enlargement, equivalent to about 1 m/s over a few frames."""

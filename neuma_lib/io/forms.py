@@ -41,11 +41,7 @@ _MOTION = {
     "particles": int,
 }
 _QUANTITIES = {"*": {"value": (float, None), "log_std": (float, None)}}
-_FIT = {
-    "law": {"*": {"*": (float, str)}},
-    "constants": _QUANTITIES,
-    "quantities": _QUANTITIES,
-}
+_FIT = {"law": {"*": {"*": (float, str)}}, "constants": _QUANTITIES, "quantities": _QUANTITIES}
 FORMS: dict[str, Any] = {
     "velocity.json": {**_MOTION, "bodies": [_MOTION]},
     "identified.json": {

@@ -252,11 +252,7 @@ class Config(Section):
             raise InputError(
                 key, f"{step:g} s is not an integer fraction of the time step {dt:g} s of {origin}"
             )
-        return TruthConfig(
-            grid=grid,
-            dt=step,
-            particles=own.particles or self.dataset.particles,
-        )
+        return TruthConfig(grid=grid, dt=step, particles=own.particles or self.dataset.particles)
 
     def video_scenes(self, name: str) -> list[str]:
         """Folders of the scenes whose videos train the law of a scene, in its replicate: itself, then the others."""

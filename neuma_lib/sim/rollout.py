@@ -229,16 +229,7 @@ def fly_and_simulate(
         nodes, contact = copies * max(1, len(bodies)) * model.nodes**3, model.contact == "particles"
         rows = nodes // model.nodes if scatter == "native" else 0
         plan = plan_memory(
-            steps,
-            len(x),
-            nodes,
-            x.element_size(),
-            cache_bytes,
-            memory,
-            total,
-            contact,
-            rows,
-            bool(bodies),
+            steps, len(x), nodes, x.element_size(), cache_bytes, memory, total, contact, rows, bool(bodies)
         )
     simulation = Simulation(
         model, regions, slices, state, steps, first, plan, scatter, total, copies, frictions, ranges

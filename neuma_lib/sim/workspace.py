@@ -269,9 +269,7 @@ class Workspace:
         of_obstacles = self.frictions[:, : len(self.size.model.obstacles)]
         rows["friction"] = np.tile(np.minimum(of_obstacles, STICKING), (len(times), 1))
         return wp.array(
-            rows,
-            dtype=obstacle_type(self.size.dtype),
-            device=wp.device_from_torch(self.size.device),
+            rows, dtype=obstacle_type(self.size.dtype), device=wp.device_from_torch(self.size.device)
         )
 
     def _holds(self, times: Sequence[float]) -> wp.array:

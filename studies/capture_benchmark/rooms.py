@@ -31,11 +31,7 @@ from neuma_lib.io.files import read_json, write_json, write_text
 from neuma_lib.io.images import read_transforms
 from neuma_lib.paper.identified_table import FITS, MATERIAL, compare_family, compare_quantities
 from neuma_lib.project.loading import read_yaml
-from studies.capture_benchmark.evaluation import (
-    compare_cameras,
-    photograph_agreement,
-    video_agreement,
-)
+from studies.capture_benchmark.evaluation import compare_cameras, photograph_agreement, video_agreement
 from studies.capture_benchmark.planned import PREFIX
 from studies.capture_benchmark.sets import body_at_rest, body_of_drop
 from studies.capture_benchmark.settings import DemoCapturesConfig

@@ -12,12 +12,7 @@ from neuma_lib.capture.calibration.lens import Lens  # noqa: E402
 from neuma_lib.capture.masks import mattes  # noqa: E402
 from neuma_lib.capture.masks.video_masks import given_masks  # noqa: E402
 from neuma_lib.capture.motion import flight
-from neuma_lib.io.images import (  # noqa: E402
-    OPENGL_TO_OPENCV,
-    read_image_set,
-    transform_world,
-    write_transforms,
-)
+from neuma_lib.io.images import OPENGL_TO_OPENCV, read_image_set, transform_world, write_transforms  # noqa: E402
 from neuma_lib.project.capture_folder import read_capture  # noqa: E402
 from tests.support.errors import refused  # noqa: E402
 

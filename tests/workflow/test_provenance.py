@@ -105,8 +105,7 @@ class TestThisProject:
         assert not [name for name in reached if name.split(".")[1] in rooms]
 
     @pytest.mark.parametrize(
-        "script",
-        ["ground_truth", "prior", "sampled_particles", "render", "chamfer_table"],
+        "script", ["ground_truth", "prior", "sampled_particles", "render", "chamfer_table"]
     )
     def test_what_does_not_render_is_free_of_it(self, script):
         assert "neuma_lib.splatting.rasterizer" not in self.reached(script)

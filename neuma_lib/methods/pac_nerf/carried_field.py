@@ -52,22 +52,14 @@ class CarriedField:
 
     @classmethod
     def load(
-        cls,
-        path: str | Path,
-        own: Mapping[str, Any],
-        density: Density,
-        device: torch.device | str = "cpu",
+        cls, path: str | Path, own: Mapping[str, Any], density: Density, device: torch.device | str = "cpu"
     ) -> CarriedField:
         """The field of a file with the options ``own`` of the method: ``spacing``, ``min_opacity`` and ``settings`` (a
         `PacNerfConfig` as plain values).
         """
         field, _ = load_field(path)
         return cls(
-            field.to(device),
-            own["spacing"],
-            own["min_opacity"],
-            PacNerfConfig(**own["settings"]),
-            density,
+            field.to(device), own["spacing"], own["min_opacity"], PacNerfConfig(**own["settings"]), density
         )
 
     def state(
