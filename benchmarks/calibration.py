@@ -9,8 +9,6 @@ intervals by cross-validation over the scenes, and the Brier score: what to expe
 because a calibration must not see what is reported.
 """
 
-from __future__ import annotations
-
 import math
 import subprocess
 from collections.abc import Mapping, Sequence, Set

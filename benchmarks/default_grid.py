@@ -8,8 +8,6 @@ this Courant number of the law. Prints root mean square distances of 2,000
 tracers over the frames [mm], averaged over the scenes, and the core seconds of a forward simulation of all of them.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from fractions import Fraction

@@ -10,8 +10,6 @@ Free motion: 1,728 particles in cells of 25 mm stretch and shear. Every motion i
 export` writes. Folders with a motion are not played again.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from dataclasses import replace

@@ -9,8 +9,6 @@ and stress a cell, and implicit steps. The start is that of `benchmarks.engine_a
 0.1 m.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from pathlib import Path

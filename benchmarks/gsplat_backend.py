@@ -9,8 +9,6 @@ Constants in the kernels of gsplat:
 - a splat ends 3.33 standard deviations from its centre, where an opacity of 1 gives 1/255.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -9,8 +9,6 @@ Dataset and reconstruction must exist (`snakemake results/SCENE/velocity.json`).
 comparison reads the truth. Settings are to be tuned on draws that are not reported.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import multiprocessing

@@ -11,8 +11,6 @@ copy, and that of the operations of its networks at the rate of a matrix product
 rasterizer are also compared with plain torch code under autograd, at a size for which that is possible.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import statistics

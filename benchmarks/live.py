@@ -12,8 +12,6 @@ the best and the median time of some frames. Other load affects all wall times a
 column uses the latter: the share of real time of the steps that fit, with one picture, into 0.1 s of one core.
 """
 
-from __future__ import annotations
-
 import statistics
 import time
 from collections.abc import Callable

@@ -9,8 +9,6 @@ family's published guess, with a modulus, yield stress or viscosity wrong by a d
 bound, see `BOUNDS`. The other constants are printed.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from typing import Any

@@ -3,8 +3,6 @@
 Genesis allocates a grid for each step that it differentiates, so that forward runs in another scene.
 """
 
-from __future__ import annotations
-
 import genesis as gs
 import numpy as np
 import torch

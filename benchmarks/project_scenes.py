@@ -1,7 +1,5 @@
 """Scenes of a project for benchmarks: arguments that select them, settings and files."""
 
-from __future__ import annotations
-
 import argparse
 from functools import reduce
 from pathlib import Path

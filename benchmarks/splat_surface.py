@@ -10,8 +10,6 @@ points on either surface to the other, and the volume over the true one, from si
 Gaussians with an unknown surface it prints both volumes.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import time

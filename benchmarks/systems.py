@@ -9,8 +9,6 @@ results/SCENE/velocity.json`). A radiance field that is missing (`.../pac_nerf/f
 the folder of --fields. Only the comparison reads the truth. Tune settings on scenes that are not reported.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from tempfile import TemporaryDirectory
 

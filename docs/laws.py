@@ -4,8 +4,6 @@ Equations are the docstrings of the classes, constants are those of `neuma_lib.m
 computed with the laws.
 """
 
-from __future__ import annotations
-
 import inspect
 import io
 import math

@@ -7,8 +7,6 @@ The first line of a recorded table names date, commit, grid and machine. `docs.r
 pages. The text `figures` of docs/results/figures.md is generated here, from files that are not copied.
 """
 
-from __future__ import annotations
-
 import argparse
 import datetime
 import platform

@@ -6,8 +6,6 @@ METHOD and COLUMN are words in it, and a fourth word is the quantity, by default
 `<!-- /name -->` the text of one of `PLACES`.
 """
 
-from __future__ import annotations
-
 import csv
 import re
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The method of a job, its files and its model, for scripts of fits and predictions."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Targets that no rule makes, with the nearest ones that can be made."""
 
-from __future__ import annotations
-
 import re
 import sys
 from collections.abc import Callable, Iterable, Sequence

@@ -6,8 +6,6 @@ the width and the level of the camera together. The silhouettes show whether the
 ball that rebounds shows its stiffness, or a lower bound of it. Other constants need photographs (docs/capture.md).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise

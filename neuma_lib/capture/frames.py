@@ -7,8 +7,6 @@ OpenCV, it reports whether a frame has a time stamp, in ticks of the file's cloc
 phone.
 """
 
-from __future__ import annotations
-
 import re
 import subprocess
 import tempfile

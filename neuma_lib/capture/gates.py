@@ -4,8 +4,6 @@ Later stages accept anything: a body with a chair in it moves and is fitted, too
 limit that good captures exceed by far, and states what to do.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 

@@ -17,8 +17,6 @@ The world is not metric. NeuMA's settings compensate with a frame interval of 10
 gravity by 1.44 relative to metres.
 """
 
-from __future__ import annotations
-
 import re
 import struct
 from collections.abc import Iterator, Sequence

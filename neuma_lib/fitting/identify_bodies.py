@@ -8,8 +8,6 @@ coarsest level of the image pyramid, from guesses, and then at the finest level 
 frames decide as in `identify`. The joint fit to all frames follows. There is no finer grid.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace

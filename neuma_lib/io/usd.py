@@ -1,7 +1,5 @@
 """A moving surface as USD (Universal Scene Description): a mesh with time samples of its points."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

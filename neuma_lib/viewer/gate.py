@@ -5,8 +5,6 @@ rejects requests of other web sites, and passes on only moves of the camera, dra
 the controls.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import http

@@ -4,8 +4,6 @@ Frames are integers of 16 or 8 bits in the range of each component, stored as di
 bytes first, and deflated. ``page.js`` decodes them and renders the Gaussians with WebGL 2.
 """
 
-from __future__ import annotations
-
 import base64
 import io
 import json

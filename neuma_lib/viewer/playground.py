@@ -1,7 +1,5 @@
 """Interactive simulation of a reconstructed body: the live simulation, its laws, and the bound Gaussians."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Mapping, Sequence
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """Scalars that colour particles: speed, stress, plastic strain, volume ratio, with ranges for a legend in SI units."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 

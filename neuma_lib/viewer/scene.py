@@ -1,7 +1,5 @@
 """Data of a viewer: Gaussians and particles of several motions of a scene, cameras and their images."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path

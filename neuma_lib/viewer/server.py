@@ -1,7 +1,5 @@
 """The viewer's server: the motions of a scene and an interactive simulation in a browser, rendered by viser."""
 
-from __future__ import annotations
-
 import string
 import threading
 import time

@@ -1,7 +1,5 @@
 """A room in Blender: textured rectangles, lamps and a moving body. Imports bpy and is used through `room`."""
 
-from __future__ import annotations
-
 import bpy
 import numpy as np
 from mathutils import Matrix, Vector

@@ -1,7 +1,5 @@
 """Compare results of the pipeline for a demo capture with the ground truth, in metres of the simulation box."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

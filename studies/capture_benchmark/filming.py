@@ -1,7 +1,5 @@
 """Photographs and videos of the demo captures: renders of Blender with a camera's exposure and noise."""
 
-from __future__ import annotations
-
 import subprocess
 from collections.abc import Iterator, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What makes a room ordinary: furniture, a ruler instead of the board, a second object in motion, and marks by hand."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

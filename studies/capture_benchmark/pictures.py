@@ -1,7 +1,5 @@
 """Textures of floors and walls with many distinct SIFT features."""
 
-from __future__ import annotations
-
 import numpy as np
 from PIL import Image, ImageDraw
 

@@ -10,8 +10,6 @@ report of the method `constants`. Only the comparison reads the truth. Results a
 and as a table to standard output.
 """
 
-from __future__ import annotations
-
 import argparse
 import re
 import resource

@@ -1,7 +1,5 @@
 """Several bodies on one grid, coloured solids, and densities that differ inside a body."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace

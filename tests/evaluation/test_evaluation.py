@@ -1,7 +1,5 @@
 """Evaluation of predicted motions with known errors."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Figures are drawn from their data in print quality. Particles, crops and tests of material points are correct."""
 
-from __future__ import annotations
-
 import ast
 import json
 import re

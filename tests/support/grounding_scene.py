@@ -1,7 +1,5 @@
 """A small grounding problem without files: a soft ball or block that a camera watches, with its motion known."""
 
-from __future__ import annotations
-
 import torch
 
 from neuma_lib.coupling.particle_binding import bind_two_pass

@@ -1,7 +1,5 @@
 """The workflow as a user runs it: real Snakemake, every stage, on a setting of two minutes (tiny.yaml)."""
 
-from __future__ import annotations
-
 import json
 import os
 import random

@@ -1,7 +1,5 @@
 """Kernels from particles to the image loss."""
 
-from __future__ import annotations
-
 import torch
 
 from neuma_lib.coupling.binding import Binding

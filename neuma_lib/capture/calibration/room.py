@@ -1,7 +1,5 @@
 """The room: poses in metres, y up, the floor at y = 0, from the board, a known length, or given poses."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -8,8 +8,6 @@ where I is the integral of (1 - x^(5/2))^(-1/2) from 0 to 1. With losses, v lies
 uncertainty. Heights are -y of the picture [px].
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """Time and place at which a falling object touches the floor, from its masks."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

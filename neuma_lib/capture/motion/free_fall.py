@@ -1,7 +1,5 @@
 """Fit the free flight of an object's centre, x(t) = x0 + v0 t + a t^2 / 2 between release and contact."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

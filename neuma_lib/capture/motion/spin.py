@@ -5,8 +5,6 @@ of a compact object is nearly constant over a few tenths of a second. The depths
 on a sphere with the area of the mask and are fitted together with the angular velocity.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

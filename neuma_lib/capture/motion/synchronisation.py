@@ -1,7 +1,5 @@
 """Frames of a take in simulation time: convert the mattes of each camera to frames for training."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -3,8 +3,6 @@
 An offset is added to the second camera's times to convert them to the first camera's clock.
 """
 
-from __future__ import annotations
-
 import subprocess
 from dataclasses import dataclass
 from pathlib import Path

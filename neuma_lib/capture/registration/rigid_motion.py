@@ -1,7 +1,5 @@
 """Free flight of a rigid body, with a parabola of its centre and constant angular momentum."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -6,8 +6,6 @@ prediction composited over the empty scene. The common background makes their PS
 they only rank methods on one video. Shadows and reflections of the object are missing in the prediction.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 
