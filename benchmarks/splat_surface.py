@@ -98,10 +98,8 @@ def between(a: trimesh.Trimesh, b: trimesh.Trimesh) -> np.ndarray:
 def compare(
     name: str, gaussians: Gaussians, truth: trimesh.Trimesh | None, chosen: argparse.Namespace
 ) -> None:
-    cameras, settings = (
-        views_around(gaussians, chosen.views, chosen.pixels),
-        SurfaceConfig(resolution=chosen.voxels),
-    )
+    cameras = views_around(gaussians, chosen.views, chosen.pixels)
+    settings = SurfaceConfig(resolution=chosen.voxels)
     for dents in (False, True):
         began = time.process_time()
         surface = splat_surface(gaussians, cameras, settings, dents=dents)

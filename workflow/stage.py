@@ -40,9 +40,8 @@ LOG_FORMAT = "[%(asctime)s] %(message)s"
 
 _LOGGER = logging.getLogger("neuma_lib.stage")
 _LOG_LOGGER = logging.getLogger("neuma_lib.log")  # for the log alone
-_USED = (
-    "core seconds: {:.2f} to start, {:.2f} of work; memory: {:.1f} MB"  # read by neuma_lib.project.timings
-)
+# read by neuma_lib.project.timings
+_USED = "core seconds: {:.2f} to start, {:.2f} of work; memory: {:.1f} MB"
 
 
 @contextmanager

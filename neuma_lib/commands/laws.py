@@ -172,9 +172,8 @@ def _scene_export(options: argparse.Namespace) -> None:
     from neuma_lib.export.scenes import EngineScene, export_scene
 
     if not Path(options.source).is_dir():
-        raise InputError(
-            options.source, "is not a folder", "Give that of a method, for example results/Ball/neuma"
-        )
+        problem = "is not a folder"
+        raise InputError(options.source, problem, "Give that of a method, for example results/Ball/neuma")
     for name in ("adaptor", "dt", "any_time_step"):
         setattr(options, name, None)
     law, known = _of_method(options)

@@ -86,9 +86,8 @@ class LPIPS(nn.Module):
             shapes = f"{tuple(images.shape)} and {tuple(references.shape)}"
             raise InputError("LPIPS", f"images of shapes {shapes}, expected (B, 3, H, W) twice")
         if min(images.shape[2:]) < SMALLEST:
-            raise InputError(
-                "LPIPS", f"images of {tuple(images.shape[2:])} pixels, expected {SMALLEST} a side"
-            )
+            problem = f"images of {tuple(images.shape[2:])} pixels, expected {SMALLEST} a side"
+            raise InputError("LPIPS", problem)
         total = images.new_zeros(len(images))
         for k, (a, b) in enumerate(zip(self.features(images), self.features(references), strict=True)):
             head = getattr(self, f"{self.net}_head{k}")

@@ -28,10 +28,8 @@ _MARGIN = 0.02  # minimum distance of the body from the walls at the start, as o
 _MOMENTS = 100  # times of a flight at which contact is tested
 _BEFORE = (0.25, 1.5)  # duration of the flight over that after contact: the initial motion must be visible
 _DURATION = 2.5  # of the longest press, in times that the existing video shows after the contact
-_PRESSED, _PLATEN = (
-    (0.1, 0.45),
-    0.02,
-)  # compression over the height of the body, and half the thickness of the platen [m]
+# compression over the height of the body, and half the thickness of the platen [m]
+_PRESSED, _PLATEN = (0.1, 0.45), 0.02
 _CLAMPED = (0.15, 0.35)  # clamped part of the height of the body
 _MIN_CLAMPED = 0.01  # of the particles
 _STEPS = 32  # the steps of a video are a multiple of this, so that its frames are evenly spaced

@@ -117,9 +117,8 @@ def fit_gaussians(
         loss = fit.step(views, batch, background, iteration / settings.iterations)
         losses.append(loss)
         if not math.isfinite(loss):
-            raise NonFiniteError(
-                "gaussians", f"the loss is {loss} in iteration {iteration}. Lower the learning rates"
-            )
+            problem = f"the loss is {loss} in iteration {iteration}. Lower the learning rates"
+            raise NonFiniteError("gaussians", problem)
         if first <= iteration < last and (iteration + 1) % rounds.every == 0:
             fit.densify(generator)
         if progress is not None:

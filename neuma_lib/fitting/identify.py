@@ -93,13 +93,11 @@ def identify(
     """
     given = [(motion, body, observation), *other_videos]
     if (count := min(len(joint_frames(several(video))) for *_, video in given)) < 4:
-        raise InputError(
-            "frames", f"{count} frames of the training view must be at least 4, to fit and to evaluate"
-        )
+        problem = f"{count} frames of the training view must be at least 4, to fit and to evaluate"
+        raise InputError("frames", problem)
     if not settings.families:
-        raise InputError(
-            "identify.families", "it has no candidates", "Add at least one elasticity with E and nu"
-        )
+        problem = "it has no candidates"
+        raise InputError("identify.families", problem, "Add at least one elasticity with E and nu")
     models = model_of_each(model, len(given))
     check_contact(models, ((one.of_body(each), joint_frames(several(video))) for one, each, video in given))
     fits_friction = settings.contact_friction == "fitted"

@@ -116,9 +116,8 @@ def identify_bodies(
     if len(names) < 2 or len(names) != len(bodies):
         raise InputError("bodies", f"{len(bodies)} bodies with {len(names)} motions must be two or more")
     if settings.contact_friction == "fitted":
-        raise InputError(
-            "identify.contact_friction", "is fitted for one body only", "Set it to given for several bodies"
-        )
+        problem = "is fitted for one body only"
+        raise InputError("identify.contact_friction", problem, "Set it to given for several bodies")
     if not settings.families:
         raise InputError("identify.families", "it has no candidates", "Add at least one elasticity")
     families = {name: Family(name, law.plain()) for name, law in settings.families.items()}

@@ -121,9 +121,8 @@ class Knowledge:
             NonFiniteError: a simulation with the identified constants diverges.
         """
         if fit.covariance is None or not np.isfinite(fit.covariance).all():
-            raise InputError(
-                "identified", "states no uncertainty of the constants", "Identify the scene again"
-            )
+            problem = "states no uncertainty of the constants"
+            raise InputError("identified", problem, "Identify the scene again")
         videos = [each.residuals(settings) for each in filmed]
         for video in videos:
             video.weight = (videos[0].fitted_pixels / video.fitted_pixels) ** 0.5

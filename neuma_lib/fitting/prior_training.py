@@ -72,9 +72,8 @@ def evaluate_prior(
             with torch.no_grad():
                 path, truth = launch.run(law, steps), launch.run(reference, steps)
         except NonFiniteError as error:
-            raise NonFiniteError(
-                "prior", f"the trained law is unstable ({error.detail}). Increase iterations"
-            ) from error
+            problem = f"the trained law is unstable ({error.detail}). Increase iterations"
+            raise NonFiniteError("prior", problem) from error
         errors.append((path.x - truth.x).square().sum(-1).mean(-1).sqrt())
         chamfers.append(float(chamfer_sequence(path.x, truth.x).mean()))
     rmse = torch.stack(errors)

@@ -183,9 +183,8 @@ def estimate_velocity(
     if model.clamps:
         return VelocityEstimate.at_rest((body.mass @ body.x0 / body.mass.sum()).cpu().numpy(), axes)
     if float(contact_clearance(model, body.x0, body.vol0)) <= 0:
-        raise InputError(
-            "frames", "the body touches a wall in the first frame", "Start the video before the contact"
-        )
+        problem = "the body touches a wall in the first frame"
+        raise InputError("frames", problem, "Start the video before the contact")
     ends = tuple(max(n + video.exposure[-1] for video in videos if n in video.frames) for n in frames)
     flight = _Flight(model, law, body, ends, others)
     minimise = partial(_minimise, axes=axes, settings=settings, progress=progress)
@@ -435,9 +434,8 @@ class _Residuals:
     def _checked(self, cost: Tensor, unknowns: np.ndarray) -> float:
         value = float(cost)
         if not np.isfinite(value):
-            raise NonFiniteError(
-                "velocity", f"rendered images are not finite at v0 = {unknowns[:3].tolist()}"
-            )
+            problem = f"rendered images are not finite at v0 = {unknowns[:3].tolist()}"
+            raise NonFiniteError("velocity", problem)
         return value
 
 

@@ -86,9 +86,8 @@ def identified_table(scenes: Sequence[Mapping[str, Any]]) -> tuple[str, str]:
         InputError: there are no scenes.
     """
     if not scenes:
-        raise InputError(
-            "tables.table1", "no scene has been identified", "Name scenes there, or set random.count"
-        )
+        problem = "no scene has been identified"
+        raise InputError("tables.table1", problem, "Name scenes there, or set random.count")
     rows, groups = [], {}
     for scene in scenes:
         identified, laws = scene["identified"], (scene["identified"], scene["truth"])

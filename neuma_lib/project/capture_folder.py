@@ -47,9 +47,8 @@ class Capture:
     def video(self, take: str, camera: str) -> Path:
         """The video of a take by a camera. Raises InputError if there is none."""
         if camera not in self.cameras_of(take):
-            raise InputError(
-                self.folder, f"no video of '{take}' by '{camera}'{hint(camera, self.takes[take])}"
-            )
+            problem = f"no video of '{take}' by '{camera}'{hint(camera, self.takes[take])}"
+            raise InputError(self.folder, problem)
         return self.takes[take][camera]
 
     def cameras_of(self, take: str) -> tuple[str, ...]:
@@ -93,9 +92,8 @@ def inside(folder: str | Path, name: str | Path) -> Path:
     root = Path(folder).resolve()
     path = (root / name).resolve()
     if path != root and root not in path.parents:
-        raise InputError(
-            Path(folder) / name, f"it is outside the capture's folder {folder}", "Copy the file there"
-        )
+        problem = f"it is outside the capture's folder {folder}"
+        raise InputError(Path(folder) / name, problem, "Copy the file there")
     return Path(folder) / name
 
 
@@ -122,9 +120,8 @@ def read_capture(folder: str | Path) -> Capture:
     cameras = sorted({camera for videos in takes.values() for camera in videos} | stills.keys())
     for camera in settings.cameras:
         if camera not in cameras:
-            raise InputError(
-                f"{source}: cameras.{camera}", f"no video or still has this name{hint(camera, cameras)}"
-            )
+            problem = f"no video or still has this name{hint(camera, cameras)}"
+            raise InputError(f"{source}: cameras.{camera}", problem)
     for name in (*cameras, *takes):
         if not NAME.fullmatch(name):
             problem = f"'{one_line(name)}' cannot name folders and results"
@@ -176,9 +173,8 @@ def _pictures(folder: Path, name: str) -> tuple[Path, ...]:
                 file, problem, "Run `pip install pillow-heif`, or convert it to JPEG and remove it"
             )
         if suffix in OTHER_PICTURES:
-            raise InputError(
-                file, "this picture format is not supported", "Convert it to JPEG, and remove it"
-            )
+            problem = "this picture format is not supported"
+            raise InputError(file, problem, "Convert it to JPEG, and remove it")
     return tuple(_by_stem(folder, name, (*PICTURES, *decoded)).values())
 
 

@@ -249,9 +249,8 @@ class Config(Section):
         substeps = round(dt / step)
         if substeps < 1 or abs(dt / step - substeps) > 1e-6 * substeps:
             key = f"{origin}.truth.dt" if own.dt else "dataset.dt"
-            raise InputError(
-                key, f"{step:g} s is not an integer fraction of the time step {dt:g} s of {origin}"
-            )
+            problem = f"{step:g} s is not an integer fraction of the time step {dt:g} s of {origin}"
+            raise InputError(key, problem)
         return TruthConfig(grid=grid, dt=step, particles=own.particles or self.dataset.particles)
 
     def video_scenes(self, name: str) -> list[str]:

@@ -244,10 +244,8 @@ def as_regions(law: Law | Sequence[MaterialRegion], count: int) -> tuple[Materia
     expected = 0
     for region in regions:
         if region.start != expected or region.stop <= region.start:
-            raise InputError(
-                f"region {region.law.name!r}",
-                f"particles {region.start} to {region.stop} must be a range that starts at {expected}",
-            )
+            problem = f"particles {region.start} to {region.stop} must be a range that starts at {expected}"
+            raise InputError(f"region {region.law.name!r}", problem)
         expected = region.stop
     if expected != count:
         raise InputError("regions", f"particles 0 to {expected} must be all of the {count} particles")
@@ -308,9 +306,8 @@ def _six_conditions(
     else:
         conditions = tuple(boundary)
         if len(conditions) != 6:
-            raise InputError(
-                "boundary", f"{len(conditions)} conditions must be one per wall: {', '.join(WALLS)}"
-            )
+            problem = f"{len(conditions)} conditions must be one per wall: {', '.join(WALLS)}"
+            raise InputError("boundary", problem)
     return tuple(_condition(condition, contact) for condition in conditions)
 
 
@@ -318,13 +315,11 @@ def _condition(condition: Condition, contact: str) -> Condition:
     """A valid condition for the kind of contact."""
     if isinstance(condition, str):
         if condition not in CONDITIONS:
-            raise InputError(
-                "boundary", f"{condition!r} must be one of {', '.join(CONDITIONS)}, or a Coulomb coefficient"
-            )
+            problem = f"{condition!r} must be one of {', '.join(CONDITIONS)}, or a Coulomb coefficient"
+            raise InputError("boundary", problem)
         if condition == "sticky" and contact == "particles":
-            raise InputError(
-                "boundary", "'sticky' needs contact of nodes", "Use no_slip, slip or a Coulomb coefficient"
-            )
+            problem = "'sticky' needs contact of nodes"
+            raise InputError("boundary", problem, "Use no_slip, slip or a Coulomb coefficient")
         return condition
     if isinstance(condition, bool) or not (isinstance(condition, (int, float)) and condition >= 0):
         raise InputError("boundary", f"the Coulomb coefficient {condition!r} must be a number of at least 0")

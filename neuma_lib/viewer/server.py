@@ -78,9 +78,8 @@ class ViewerServer:
             )
         if self.port != gate.port:
             self.server.stop()
-            raise InputError(
-                "viser", f"release {self.viser.__version__} is not supported", "Install viser 1.1.1"
-            )
+            problem = f"release {self.viser.__version__} is not supported"
+            raise InputError("viser", problem, "Install viser 1.1.1")
         self._closing, self._dirty, self._playing = threading.Event(), True, False
         self._clock, self._number, self._nodes = 0.0, -1, {}
         self._reach: dict[tuple[str, str], float] = {}

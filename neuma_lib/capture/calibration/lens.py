@@ -72,9 +72,8 @@ class Lens:
         """
         if image.shape[:2] != (self.height, self.width):
             height, width = image.shape[:2]
-            raise InputError(
-                "image", f"a picture of {width}x{height} does not fit the lens of {self.width}x{self.height}"
-            )
+            problem = f"a picture of {width}x{height} does not fit the lens of {self.width}x{self.height}"
+            raise InputError("image", problem)
         if not self.distortion.any():
             return image
         cv2 = opencv()

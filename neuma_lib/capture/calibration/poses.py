@@ -509,9 +509,8 @@ def given_poses(path: str | Path, pictures: Mapping[str, Path]) -> Poses:
         size = dict(zip("wh", picture_size(file)))
         lens = read_lens({**_centred(frame, **size), **size}, f"{path}: {name}")
         if (frame.get("w", lens.width), frame.get("h", lens.height)) != (lens.width, lens.height):
-            raise InputError(
-                f"{path}: {name}", f"w, h do not match the picture of {lens.width}x{lens.height} pixels"
-            )
+            problem = f"w, h do not match the picture of {lens.width}x{lens.height} pixels"
+            raise InputError(f"{path}: {name}", problem)
         names.append(name)
         lenses.append(lens)
         viewmats.append(np.linalg.inv(np.array(frame["transform_matrix"], np.float64) @ OPENGL_TO_OPENCV))

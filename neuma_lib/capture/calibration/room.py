@@ -40,14 +40,10 @@ from neuma_lib.project.capture_folder import PHOTOGRAPHS
 
 FLOOR_TOLERANCE = 0.005
 """Distance of near points from the floor, relative to the distance from the cameras to the points."""
-_SUPPORT, _MIN_SUPPORT = (
-    4.0,
-    40,
-)  # distance from a selected object, in half sizes, and number of points on its floor
-_MARK = (
-    1.5,
-    0.001,
-)  # standard deviation of a marked point [px], and as share of the longer side of the photograph
+# distance from a selected object, in half sizes, and number of points on its floor
+_SUPPORT, _MIN_SUPPORT = 4.0, 40
+# standard deviation of a marked point [px], and as share of the longer side of the photograph
+_MARK = (1.5, 0.001)
 BOX_MIDDLE = (0.5, 0.0, 0.5)  # position of the room's origin, on the floor, in the simulation box [m]
 
 

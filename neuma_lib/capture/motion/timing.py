@@ -56,9 +56,8 @@ def read_sound(path: str | Path) -> np.ndarray | None:
         raise InputError(path, f"its sound is longer than {MAX_SOUND} s", "Cut the video to the take")
     message = errors.decode(errors="replace")
     if process.returncode and "does not contain any stream" not in message:
-        raise InputError(
-            path, f"cannot be read as a video ({one_line(message)})", "Copy it from the camera again"
-        )
+        problem = f"cannot be read as a video ({one_line(message)})"
+        raise InputError(path, problem, "Copy it from the camera again")
     return np.frombuffer(sound, np.float32) if sound else None
 
 

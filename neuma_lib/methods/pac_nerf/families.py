@@ -101,9 +101,8 @@ def _to_stored(name: str, value: float) -> float:
         return value
     if name == "nu":
         if not abs(value) < MAX_POISSON:
-            raise InputError(
-                "pac_nerf.families.nu", f"the size of {value:g} must be below {MAX_POISSON} to be fitted"
-            )
+            problem = f"the size of {value:g} must be below {MAX_POISSON} to be fitted"
+            raise InputError("pac_nerf.families.nu", problem)
         return MAX_POISSON * math.atanh(value / MAX_POISSON)
     if not value > 0:
         raise InputError(f"pac_nerf.families.{name}", f"{value:g} must be positive to be fitted")

@@ -26,10 +26,8 @@ class Lattice:
 
     def __post_init__(self):
         if self.voxel <= 0 or min(self.nodes) < 2:
-            raise InputError(
-                "lattice",
-                f"nodes = {self.nodes} must be at least 2 per axis and voxel = {self.voxel} m positive",
-            )
+            problem = f"nodes = {self.nodes} must be at least 2 per axis and voxel = {self.voxel} m positive"
+            raise InputError("lattice", problem)
 
     @classmethod
     def spanning(cls, low: Tensor, high: Tensor, voxel: float) -> Lattice:

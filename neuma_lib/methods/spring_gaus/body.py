@@ -34,9 +34,8 @@ class SpringBody:
     def with_network(cls, x0: Tensor, index: Tensor, network: SpringNetwork, carriers: int) -> SpringBody:
         """The body of an existing network. Raises InputError if its anchors are not the particles ``index``."""
         if index.max() >= len(x0) or not torch.equal(x0[index], network.anchors):
-            raise InputError(
-                "springs", "the anchors are not particles of the body", "Run the rule fit_spring_gaus again"
-            )
+            problem = "the anchors are not particles of the body"
+            raise InputError("springs", problem, "Run the rule fit_spring_gaus again")
         return cls(index, network, Interpolation(x0, network.anchors, carriers))
 
     def start(self, state: State) -> tuple[Tensor, Tensor]:

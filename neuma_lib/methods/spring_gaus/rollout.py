@@ -36,13 +36,11 @@ class SpringModel:
     def of(cls, model: MPM, substeps: int = 1) -> SpringModel:
         """Gravity, time step and box of an MPM model, with planes where bodies come to rest in it."""
         if model.colliders or model.clamps:
-            raise InputError(
-                "spring_gaus", "springs touch only the faces of the cube", "Leave this method out"
-            )
+            problem = "springs touch only the faces of the cube"
+            raise InputError("spring_gaus", problem, "Leave this method out")
         low, high = model.free_range
-        half = (
-            0.5 * model.dx if model.wall_nodes else 0.0
-        )  # contact of nodes starts half a cell before the wall
+        # contact of nodes starts half a cell before the wall
+        half = 0.5 * model.dx if model.wall_nodes else 0.0
         return cls(model.dt, model.gravity, low - half, high + half, substeps)
 
 
