@@ -47,7 +47,7 @@ from neuma_lib.geometry.shapes import place
 from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.io.files import read_json, write_json, write_text
 from neuma_lib.mechanics.analytic import analytic_law
-from neuma_lib.mechanics.combinations import physical
+from neuma_lib.mechanics.combinations import constants_of, physical
 from neuma_lib.project.loading import load, merged, read_yaml
 from neuma_lib.project.settings import Config
 from neuma_lib.sim.model import MPM
@@ -167,8 +167,7 @@ class Lab:
 
     def summary(self, fit: FamilyFit) -> dict[str, Any]:
         """Standard deviations, and logarithms of the ratios to the true constants where there are such."""
-        law = {key: value for part in self.law.values() for key, value in part.items() if key != "name"}
-        truth, values = physical(law), physical(fit.values)
+        truth, values = physical(constants_of(self.law)), physical(fit.values)
         errors = {key: math.log(values[key] / truth[key]) for key in values.keys() & truth.keys()}
         return {"family": fit.family.name, "std": stds(fit, self.settings.identify), "error": errors}
 

@@ -48,7 +48,7 @@ from neuma_lib.fitting.family_run import FamilyRun
 from neuma_lib.fitting.frame_batches import check_contact
 from neuma_lib.fitting.identified import FamilyFit, Identified
 from neuma_lib.fitting.video_residuals import VideoResiduals
-from neuma_lib.mechanics.combinations import Values
+from neuma_lib.mechanics.combinations import Values, constants_of
 from neuma_lib.sim.model import MPM, model_of_each
 from neuma_lib.splatting.observation import Observation, joint_frames, several
 
@@ -113,7 +113,7 @@ def identify(
     for video in videos:
         video.hold_out(families[0], settings.held_out)
         video.weight = (videos[0].fitted_pixels / video.fitted_pixels) ** 0.5
-    published_values = _constants(published) if published else {}
+    published_values = constants_of(published) if published else {}
     running: list[FamilyRun] = []
     rounds = len(settings.pyramid)
     other_grid = bool(refined) and settings.refinement > 1
@@ -418,8 +418,3 @@ def select_family(fits: Sequence[FamilyFit], settings: IdentifyConfig) -> tuple[
         and fit.score - best.score < settings.tie
         and not (fit.family.contains(best.family) and fit.score >= best.score)
     ]
-
-
-def _constants(spec: Mapping[str, Mapping[str, Any]]) -> Values:
-    """All constants of a specification."""
-    return {key: float(value) for part in spec.values() for key, value in part.items() if key != "name"}

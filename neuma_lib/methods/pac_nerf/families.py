@@ -14,6 +14,7 @@ from torch import Tensor
 from neuma_lib.errors import InputError
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.catalogue import lame
+from neuma_lib.mechanics.combinations import constants_of
 from neuma_lib.mechanics.law import Law
 from neuma_lib.methods.pac_nerf.options import MODULI, PacFamilyConfig, PacNerfConfig
 
@@ -142,5 +143,5 @@ def choose_family(
         name = matching[0]
     if name not in families:
         raise InputError("pac_nerf.family", f"{name!r} must be one of {', '.join(families)}")
-    known = {key: value for part in (prior or {}).values() for key, value in part.items() if key != "name"}
-    return name, FamilyConstants(families[name], known if settings.guesses == "prior" else None)
+    known = constants_of(prior or {}) if settings.guesses == "prior" else None
+    return name, FamilyConstants(families[name], known)
