@@ -15,8 +15,6 @@ after the other, until all constants are determined. Results are written after e
 skipped.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -302,7 +300,7 @@ class Material:
     refused: str
 
     @classmethod
-    def of(cls, name: str, settings: Config, results: Mapping[Task, dict[str, Any]]) -> Material:
+    def of(cls, name: str, settings: Config, results: Mapping[Task, dict[str, Any]]) -> "Material":
         own = {task: result for task, result in results.items() if task.scene == name}
         pools = [result for result in own.values() if "candidates" in result]
         fits = [fit for each in pools for fit in each["candidates"] if "std" in fit]

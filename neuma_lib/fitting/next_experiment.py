@@ -22,8 +22,6 @@ All of this is to first order about the identified constants, and assumes that a
 existing ones.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -108,7 +106,7 @@ class Knowledge:
         filmed: Sequence[Experiment],
         settings: IdentifyConfig,
         rivals: Sequence[tuple[Family, Values]] = (),
-    ) -> Knowledge:
+    ) -> "Knowledge":
         """Simulate the existing videos once more, which calibrates the noise, and fit the rivals to them.
 
         Args:

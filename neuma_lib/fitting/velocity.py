@@ -18,8 +18,6 @@ spreading fluid conserves its volume.
 A spin that does not differ significantly from 0 is set to 0, with its standard deviation as an upper limit.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -97,7 +95,7 @@ class VelocityEstimate:
     ridge: float
 
     @classmethod
-    def at_rest(cls, centre: np.ndarray, axes: np.ndarray) -> VelocityEstimate:
+    def at_rest(cls, centre: np.ndarray, axes: np.ndarray) -> "VelocityEstimate":
         """The motion of a body that is held at the start, which is exact."""
         zero = np.zeros(3)
         exact = dict.fromkeys(

@@ -4,8 +4,6 @@ The surface is more accurate than a pixel or voxel (see `neuma_lib.geometry.visu
 shows stay filled unless depth maps are given. Gaussians fitted to the same views bound the search.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -43,7 +41,7 @@ class _Grid:
     counts: NDArray[np.int64]
 
     @classmethod
-    def around(cls, lower: Array, upper: Array, resolution: int) -> _Grid:
+    def around(cls, lower: Array, upper: Array, resolution: int) -> "_Grid":
         spacing = float((upper - lower).max()) / resolution
         return cls(lower, spacing, np.ceil((upper - lower) / spacing).astype(np.int64) + 1)
 

@@ -1,7 +1,5 @@
 """Methods on scenes: options, runs and paths of a preset or variant. No file is read or has to exist."""
 
-from __future__ import annotations
-
 import typing
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -37,7 +35,7 @@ class ProjectCase(Case):
     method: Method
     together: tuple[str, str] | None = None
 
-    def on_moved(self) -> ProjectCase:
+    def on_moved(self) -> "ProjectCase":
         return replace(self, scene=self.moved)
 
     @property

@@ -1,7 +1,5 @@
 """Constants of a simulation: grid, time step, gravity, walls, and the laws of ranges of particles."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -115,19 +113,19 @@ class MPM:
         return tuple(each.friction for each in (*self.obstacles, *self.pairs))
 
     @cached_property
-    def frictionless(self) -> MPM:
+    def frictionless(self) -> "MPM":
         """The same model for all models that differ only in `frictions`."""
         if self.contact != "particles":
             return self
         pairs = tuple(replace(pair, friction=0.0) for pair in self.pairs)
         return replace(self.with_friction(0.0), pairs=pairs)
 
-    def with_pair_frictions(self, frictions: Sequence[float]) -> MPM:
+    def with_pair_frictions(self, frictions: Sequence[float]) -> "MPM":
         """This model with other Coulomb coefficients of its pairs of bodies."""
         pairs = zip(self.pairs, frictions, strict=True)
         return replace(self, pairs=tuple(replace(pair, friction=own) for pair, own in pairs))
 
-    def with_friction(self, friction: float, given: bool = True) -> MPM:
+    def with_friction(self, friction: float, given: bool = True) -> "MPM":
         """This model with a Coulomb coefficient of all obstacles, or only of those that stick if not ``given``.
 
         Raises:

@@ -4,8 +4,6 @@ The world is the simulation box: y up, the floor at y = 0, x along the board's w
 in the settings are relative to the middle of the floor.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -133,11 +131,11 @@ class Pose:
     def apply(self, points: np.ndarray) -> np.ndarray:
         return points @ self.rotation.T + self.translation
 
-    def after(self, first: Pose) -> Pose:
+    def after(self, first: "Pose") -> "Pose":
         """The composition: first ``first``, then this one."""
         return Pose(self.rotation @ first.rotation, self.rotation @ first.translation + self.translation)
 
-    def inverse(self) -> Pose:
+    def inverse(self) -> "Pose":
         return Pose(self.rotation.T, -self.rotation.T @ self.translation)
 
     def plain(self) -> dict:

@@ -1,7 +1,5 @@
 """Camera poses: from structure from motion on the photographs, from the board alone, or from a file."""
 
-from __future__ import annotations
-
 import copy
 import shutil
 from collections.abc import Collection, Mapping, Sequence
@@ -72,7 +70,7 @@ class Poses:
                 row[self.sightings[self.names.index(name)]] = True
         return seen
 
-    def moved(self, by: Similarity) -> Poses:
+    def moved(self, by: Similarity) -> "Poses":
         """The poses after a similarity of the world."""
         return replace(self, viewmats=by.move_cameras(self.viewmats), points=by.apply(self.points))
 

@@ -1,7 +1,5 @@
 """Values on a regular lattice of nodes: trilinear interpolation at points, and means of values of particles."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -30,7 +28,7 @@ class Lattice:
             raise InputError("lattice", problem)
 
     @classmethod
-    def spanning(cls, low: Tensor, high: Tensor, voxel: float) -> Lattice:
+    def spanning(cls, low: Tensor, high: Tensor, voxel: float) -> "Lattice":
         """The smallest lattice with nodes at multiples of the voxel that contains two corners (3,) [m]."""
         first = torch.floor(low.detach().double() / voxel).long().tolist()
         last = torch.floor(high.detach().double() / voxel).long().tolist()

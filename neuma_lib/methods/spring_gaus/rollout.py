@@ -1,7 +1,5 @@
 """Differentiable simulation of a network of springs in the box, with adaptive substeps."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -33,7 +31,7 @@ class SpringModel:
     substeps: int = 1  # minimum number of substeps per time step
 
     @classmethod
-    def of(cls, model: MPM, substeps: int = 1) -> SpringModel:
+    def of(cls, model: MPM, substeps: int = 1) -> "SpringModel":
         """Gravity, time step and box of an MPM model, with planes where bodies come to rest in it."""
         if model.colliders or model.clamps:
             problem = "springs touch only the faces of the cube"
