@@ -26,8 +26,7 @@ from neuma_lib.io.files import read_json, write_json
 from neuma_lib.paper.calibration_table import TARGETS, errors_in_std
 
 FOLDS = 5
-TEMPERATURES = tuple(np.geomspace(0.01, 30, 81))
-"""Candidates of `fitted_temperature`."""
+TEMPERATURES = tuple(np.geomspace(0.01, 30, 81))  # candidates of `fitted_temperature`
 
 
 def measured_quantiles(z: Sequence[float]) -> Quantiles:

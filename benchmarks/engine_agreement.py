@@ -37,8 +37,7 @@ CONSTANTS = {
     "fluid_projection": {},
     "viscous_flow": {"viscosity": 4.0},
 }
-STEPS = {"genesis": 5e-4, "newton": 1e-3}
-"""Time step of free motion [s]."""
+STEPS = {"genesis": 5e-4, "newton": 1e-3}  # time step of free motion [s]
 DROPS = {  # elasticity and time step [s] of each engine
     "genesis": ("neo_hookean", 5e-4),
     "newton": ("hencky", 2e-3),

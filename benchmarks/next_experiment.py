@@ -320,11 +320,9 @@ class Material:
         """Logarithm of a measure of the best-ranked experiment of some kinds, or of all, over random launches."""
         chosen = (self.of_kinds(*kinds) if kinds else self.fits)[:1]
         launches = self.of_kinds("launch")
-        return (
-            [measure(chosen[0]) - float(np.mean([measure(fit) for fit in launches]))]
-            if chosen and launches
-            else []
-        )
+        if chosen and launches:
+            return [measure(chosen[0]) - float(np.mean([measure(fit) for fit in launches]))]
+        return []
 
     def over_best(self) -> list[float]:
         return [log_std(self.fits[0]) - min(map(log_std, self.fits))] if self.fits else []

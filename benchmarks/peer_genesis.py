@@ -10,8 +10,7 @@ import torch
 from benchmarks.peer_engines import Case, Rollout
 from neuma_lib.export.materials import engine_material
 
-PADDING = 3
-"""Cells at the walls of its domain that Genesis does not use."""
+PADDING = 3  # cells at the walls of its domain that Genesis does not use
 
 
 class GenesisRollout(Rollout):

@@ -27,10 +27,8 @@ from neuma_lib.geometry.splat_surface import splat_surface, views_around
 from neuma_lib.io.gaussians import load_gaussians
 from neuma_lib.splatting.gaussians import Gaussians, quaternions
 
-SIZE = 0.4
-"""Longest side [m]."""
-SAMPLES = 20_000
-"""Points on a surface that distances are measured at."""
+SIZE = 0.4  # longest side [m]
+SAMPLES = 20_000  # points on a surface that distances are measured at
 
 
 def bowl() -> trimesh.Trimesh:

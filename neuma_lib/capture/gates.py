@@ -73,11 +73,9 @@ def check_volume(volume: float, hull: float, watertight: bool, where: str) -> No
     low, high = VOLUME_RATIO
     ratio = volume / max(hull, 1e-300)
     if not watertight or not low <= ratio <= high:
-        problem = (
-            "the surface of the object is not closed"
-            if not watertight
-            else "the volume of the surface is wrong"
-        )
+        problem = "the volume of the surface is wrong"
+        if not watertight:
+            problem = "the surface of the object is not closed"
         raise InputError(
             where,
             f"{problem}: {1e3 * volume:.3f} l, the visual hull of the masks has {1e3 * hull:.3f} l, a ratio of"

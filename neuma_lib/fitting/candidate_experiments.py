@@ -158,11 +158,10 @@ def _launch(
     towards[1] = -abs(towards[1])
     velocity = [_rounded(lab.max_speed * draw[0] * n) for n in towards]
     spin = [_rounded(lab.max_spin * draw[1] * n) for n in _direction(draw[4], draw[5])]
-    turned = (
-        Rotation.from_rotvec(math.pi * draw[8] * _direction(draw[6], draw[7]))
-        if turn
-        else Rotation.identity()
-    )
+    if turn:
+        turned = Rotation.from_rotvec(math.pi * draw[8] * _direction(draw[6], draw[7]))
+    else:
+        turned = Rotation.identity()
     rotation = [_rounded(angle) for angle in turned.as_rotvec()]
     R = Rotation.from_rotvec(rotation).as_matrix()
     size = np.ptp(body.x0.double().cpu().numpy() @ R.T, axis=0)

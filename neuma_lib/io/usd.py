@@ -10,8 +10,7 @@ from neuma_lib.geometry.obstacles import Obstacle
 from neuma_lib.io.files import atomic
 from neuma_lib.io.gltf import linear, mesh_names, parts_of
 
-CODES_A_SECOND = 24.0
-"""USD time codes per second; frames may have fractional codes."""
+CODES_A_SECOND = 24.0  # USD time codes per second; frames may have fractional codes
 
 
 def write_usd(

@@ -10,10 +10,8 @@ from torch import Tensor
 
 from neuma_lib.mechanics.law import Law
 
-_PERCENTILE = 99.5
-"""Upper end of a legend, robust to single detached particles."""
-_NEIGHBOURS = 16
-"""Number of nearest particles in the fit of a deformation gradient."""
+_PERCENTILE = 99.5  # upper end of a legend, robust to single detached particles
+_NEIGHBOURS = 16  # number of nearest particles in the fit of a deformation gradient
 
 
 @dataclass(frozen=True)

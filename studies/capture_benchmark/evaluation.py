@@ -17,10 +17,8 @@ from neuma_lib.geometry.skinning import skinning_matrix
 from neuma_lib.io.images import read_image_set, read_transforms
 from studies.capture_benchmark.room import Moving
 
-FINER = 4
-"""Supersampling factor of silhouettes."""
-EVERY = 4
-"""Stride of the video frames that are compared with true silhouettes."""
+FINER = 4  # supersampling factor of silhouettes
+EVERY = 4  # stride of the video frames that are compared with true silhouettes
 
 
 @dataclass(frozen=True)

@@ -15,10 +15,8 @@ RULER = (0.40, 0.03, 0.001)
 """Length, width, and side of a pixel of the ruler that lies in place of the board [m]."""
 NEAR, FREE = (0.52, 0.8), 0.3
 """Distances of low pieces from the middle, and from the middles of object and board [m]."""
-TEXEL = 0.002
-"""Side of a pixel of furniture [m]."""
-BORDER = 12
-"""Distance of marks from the border of a photograph [px]."""
+TEXEL = 0.002  # side of a pixel of furniture [m]
+BORDER = 12  # distance of marks from the border of a photograph [px]
 
 
 def furniture(

@@ -36,8 +36,7 @@ from studies.capture_benchmark.settings import DemoCapturesConfig
 
 SETTINGS = Path("studies/capture_benchmark/rooms.yaml")
 REPORT = "constants/report.html"
-DEVIATIONS = 2.0
-"""Half width of the band around a constant, in standard deviations of the logarithm."""
+DEVIATIONS = 2.0  # half width of the band around a constant, in standard deviations of the logarithm
 
 
 def main() -> None:

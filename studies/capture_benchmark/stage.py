@@ -20,12 +20,9 @@ from studies.capture_benchmark.settings import (
     LensConfig,
 )
 
-MIDDLE = np.array([0.5, 0.0, 0.5])
-"""The middle of the floor in the simulation box [m]."""
-POLYNOMIAL = 4
-"""Degree of the lens polynomial, from distance in the picture to angle."""
-BEYOND = 1.05
-"""Range of the polynomial fit, relative to the distance of the picture's corners."""
+MIDDLE = np.array([0.5, 0.0, 0.5])  # the middle of the floor in the simulation box [m]
+POLYNOMIAL = 4  # degree of the lens polynomial, from distance in the picture to angle
+BEYOND = 1.05  # range of the polynomial fit, relative to the distance of the picture's corners
 
 
 @dataclass(frozen=True, eq=False)

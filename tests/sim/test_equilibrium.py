@@ -21,8 +21,7 @@ from tests.support import hanging_beam as beam
 from tests.support.errors import refused
 
 pytestmark = pytest.mark.core
-FLOOR = Clamp((-1.0, -1.0, -1.0), (0.0, 1.0, 1.0))
-"""Holds x <= 0."""
+FLOOR = Clamp((-1.0, -1.0, -1.0), (0.0, 1.0, 1.0))  # holds x <= 0
 
 
 def law(mu=93.0, nu=0.49, name="neo_hookean"):
