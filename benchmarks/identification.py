@@ -26,6 +26,7 @@ from benchmarks.project_scenes import (
     refined_bodies,
     scene_parser,
     simulator,
+    true_tracers,
 )
 from benchmarks.timing import core_seconds
 from neuma_lib.config.identify import IdentifyConfig
@@ -33,7 +34,6 @@ from neuma_lib.evaluation.metrics import tracer_errors
 from neuma_lib.fitting.identified import Identified
 from neuma_lib.fitting.identify import identify
 from neuma_lib.io.files import write_json
-from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.images import load_observation
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.combinations import constants_of, physical
@@ -42,7 +42,6 @@ from neuma_lib.project.loading import merged
 from neuma_lib.project.settings import Config
 from neuma_lib.sim.prediction import predict
 
-TRACERS = 2000  # of the truth's, for the motion
 COVERED = 2.0  # standard deviations
 CLOSE = 0.1  # relative error
 
@@ -72,9 +71,7 @@ def evaluate(job: tuple[str, Config, Mapping[str, Any]]) -> dict[str, Any]:
         "combinations": _combinations(identified, truth),
         "found": found,
     }
-    arrays, _ = read_arrays(data / "truth.h5", required=("tracers",), only=("tracers",))
-    tracers = torch.from_numpy(arrays["tracers"])
-    tracers = tracers[:, :: max(1, tracers.shape[1] // TRACERS)].to(body.x0)
+    tracers = true_tracers(settings, name)[0].to(body.x0)
     laws = {"identified": found["law"], "true_law": truth}
     starts = {"velocity": motion, "fitted": identified.best.motions[0]}
     for (law, spec), (start, initial) in product(laws.items(), starts.items()):

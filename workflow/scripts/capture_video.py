@@ -2,8 +2,6 @@
 
 from pathlib import Path
 
-import numpy as np
-
 from neuma_lib.capture.motion.synchronisation import (
     chosen_frames,
     frame_times,
@@ -33,8 +31,7 @@ def main(inputs, output, params, run) -> None:
     for view, (camera, transforms, timeline, row_time, exposure) in enumerate(files):
         data, images = read_transforms(transforms), read_image_set(transforms).images
         frames = data["frames"]
-        rows = np.array([np.flatnonzero(image[..., 3].any(axis=1)).mean() + 0.5 for image in images])
-        times = frame_times(frames, rows, row_time, read_json(timeline)["height"])
+        times = frame_times(frames, images, row_time, read_json(timeline)["height"])
         times += registration["offsets_s"][camera] - registration["t0_s"]
         chosen = chosen_frames(times, params.duration, params.frames, f"{params.name}, {camera}")
         for k in chosen:
