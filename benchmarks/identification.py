@@ -60,19 +60,19 @@ def evaluate(job: tuple[str, Config, Mapping[str, Any]]) -> dict[str, Any]:
     identified = identify(model, motion, body, video, chosen, prior_of(settings, scene), refined=refined)
     seconds = core_seconds() - before
     truth = scene.law.plain()
-    found = identified.as_dict()
+    record = identified.as_dict()
     row = {
         "scene": name,
         "truth": truth,
         "core_seconds": seconds,
-        "family_is": compare_family(found, truth) if right_families(found, truth) else None,
-        "quantities": compare_quantities(found, truth),
-        "material": compare_quantities(found, truth, MATERIAL),
+        "family_is": compare_family(record, truth) if right_families(record, truth) else None,
+        "quantities": compare_quantities(record, truth),
+        "material": compare_quantities(record, truth, MATERIAL),
         "combinations": _combinations(identified, truth),
-        "found": found,
+        "found": record,
     }
     tracers = true_tracers(settings, name)[0].to(body.x0)
-    laws = {"identified": found["law"], "true_law": truth}
+    laws = {"identified": record["law"], "true_law": truth}
     starts = {"velocity": motion, "fitted": identified.best.motions[0]}
     for (law, spec), (start, initial) in product(laws.items(), starts.items()):
         state = initial.of_body(body)
@@ -120,11 +120,11 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> str:
 
 def lines_of(row: Mapping[str, Any]) -> str:
     """Readable lines of a scene."""
-    found = row["found"]
-    ties = f" (tie with {', '.join(found['ties'])})" if found["ties"] else ""
+    record = row["found"]
+    ties = f" (tie with {', '.join(record['ties'])})" if record["ties"] else ""
     lines = [
-        f"{row['scene']}: {found['family']}{ties}, {row['family_is'] or 'truth is no candidate'}; "
-        f"{found['rollouts']} rollouts, {row['core_seconds']:.0f} core s; "
+        f"{row['scene']}: {record['family']}{ties}, {row['family_is'] or 'truth is no candidate'}; "
+        f"{record['rollouts']} rollouts, {row['core_seconds']:.0f} core s; "
         + ", ".join(f"{key[5:]} {value:.2f}" for key, value in row.items() if key.startswith("rmse"))
     ]
     for of, e in [("quantities", e) for e in row["quantities"]] + [("material", e) for e in row["material"]]:
