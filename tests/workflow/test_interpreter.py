@@ -1,4 +1,5 @@
-"""What Python does before a script: several GPUs for the jobs of one Snakemake, and no collection of garbage."""
+"""What Python does before a script: several GPUs for the jobs of one Snakemake, one thread for libraries, and no
+collection of garbage."""
 
 import os
 import subprocess
@@ -56,6 +57,21 @@ def test_others_and_the_choice_of_a_user_are_left_alone(start):
     assert start(folder="elsewhere")[1] == "None"
     assert start(NEUMA_GPUS="")[1] == "None"
     assert start(CUDA_VISIBLE_DEVICES="7")[1] == "7"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="counts the threads in /proc")
+def test_libraries_use_one_thread_whatever_the_threads_of_the_job(tmp_path):
+    """Snakemake sets these variables to the threads of the job."""
+    script = tmp_path / ".snakemake" / "scripts" / "job.py"
+    script.parent.mkdir(parents=True)
+    script.write_text(
+        "import os\nimport numpy as np\nnp.ones((500, 500)) @ np.ones((500, 500))\n"
+        "print(len(os.listdir('/proc/self/task')))\n"
+    )
+    limits = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "2")
+    environment = os.environ | limits | {"PYTHONPATH": str(INTERPRETER)}
+    done = subprocess.run([sys.executable, script], env=environment, stdout=subprocess.PIPE)
+    assert done.stdout == b"1\n"
 
 
 def test_garbage_is_collected_from_the_stage_on_without_the_objects_of_imports(tmp_path):

@@ -1,6 +1,10 @@
-"""What Python does before a script of a job: disable garbage collection during imports, and choose a GPU.
+"""What Python does before a script of a job: disable garbage collection during imports, limit libraries to one thread,
+and choose a GPU.
 
 Imports create many objects and no garbage. `workflow.stage.run_script` enables collection again.
+
+Snakemake lets libraries of linear algebra use the threads of a job. Their sums would depend on that number, and they
+wait actively for work, on the cores that the threads of `neuma_lib.threads` need.
 
 With NEUMA_GPUS=2, each script sees one of two GPUs, shared out evenly. This must precede torch, Warp and Blender, which
 look for devices. Each GPU has as many places as are asked for, and a script takes the lowest that is free on any. They
@@ -14,6 +18,8 @@ import platform
 import sys
 from itertools import count
 from pathlib import Path
+
+THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 
 
 def claim_gpu(gpus: int) -> tuple[int, object]:
@@ -35,6 +41,7 @@ def claim_gpu(gpus: int) -> tuple[int, object]:
 # sys.argv is not there yet.
 if any(f"{os.sep}.snakemake{os.sep}scripts{os.sep}" in word for word in sys.orig_argv[:4]):
     gc.disable()
+    os.environ.update(dict.fromkeys(THREAD_LIMITS, "1"))
     if os.environ.get("NEUMA_GPUS", "").isdigit() and "CUDA_VISIBLE_DEVICES" not in os.environ:
         _gpu, _claim = claim_gpu(max(1, int(os.environ["NEUMA_GPUS"])))
         os.environ["CUDA_VISIBLE_DEVICES"] = str(_gpu)

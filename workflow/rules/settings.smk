@@ -65,15 +65,13 @@ GPU = int({"cpu": False, "cuda": True, "auto": HAS_CUDA}[SETTINGS.device])
 EITHER_DEVICE = "cpu" if SETTINGS.device == "cpu" else "auto"
 EITHER_GPU = int(GPU and HAS_CUDA)
 
-# Scripts run in separate processes. They find the library, share one kernel cache, and use one thread each (two OpenMP
-# threads on a busy machine are far slower than one). NEUMA_GPUS is the number of GPUs to spread them over.
-THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
+# Scripts run in separate processes. They find the library and share one kernel cache. NEUMA_GPUS is the number of GPUs
+# to spread them over.
 FOLDERS = [str(ROOT / "workflow" / "interpreter"), str(ROOT)]
 os.environ.update(
     {
         "PYTHONPATH": os.pathsep.join([*FOLDERS, *filter(None, [os.environ.get("PYTHONPATH")])]),
         "NEUMA_KERNEL_CACHE": str(Path(SETTINGS.kernel_cache).resolve()),
-        **{name: os.environ.get(name, "1") for name in THREAD_LIMITS},
     }
 )
 
