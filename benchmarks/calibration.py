@@ -9,8 +9,6 @@ intervals by cross-validation over the scenes, and the Brier score: what to expe
 because a calibration must not see what is reported.
 """
 
-from __future__ import annotations
-
 import math
 import subprocess
 from collections.abc import Mapping, Sequence, Set
@@ -22,20 +20,13 @@ import numpy as np
 
 from benchmarks.timing import parser_of
 from neuma_lib.errors import InputError
-from neuma_lib.evaluation.calibration import (
-    FILE,
-    LEVELS,
-    QUANTITIES,
-    Quantiles,
-    family_probabilities,
-)
+from neuma_lib.evaluation.calibration import FILE, LEVELS, QUANTITIES, Quantiles, family_probabilities
 from neuma_lib.evaluation.coverage import brier_score, mean_over_scenes
 from neuma_lib.io.files import read_json, write_json
 from neuma_lib.paper.calibration_table import TARGETS, errors_in_std
 
 FOLDS = 5
-TEMPERATURES = tuple(np.geomspace(0.01, 30, 81))
-"""Candidates of `fitted_temperature`."""
+TEMPERATURES = tuple(np.geomspace(0.01, 30, 81))  # candidates of `fitted_temperature`
 
 
 def measured_quantiles(z: Sequence[float]) -> Quantiles:

@@ -6,8 +6,6 @@ Truth and prediction are two sets of samples of the ball, as in an evaluation. T
 displacement.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 import trimesh

@@ -8,8 +8,6 @@ this Courant number of the law. Prints root mean square distances of 2,000
 tracers over the frames [mm], averaged over the scenes, and the core seconds of a forward simulation of all of them.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from fractions import Fraction
@@ -18,19 +16,16 @@ from pathlib import Path
 
 import torch
 
-from benchmarks.project_scenes import chosen_scenes, scene_parser
+from benchmarks.project_scenes import chosen_scenes, scene_parser, true_tracers
 from neuma_lib.errors import NonFiniteError
 from neuma_lib.evaluation.metrics import tracer_errors
 from neuma_lib.geometry.shapes import place
 from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.io.files import write_json
-from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.sim.model import MPM
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
-
-TRACERS = 2000
 
 
 def error_of(
@@ -38,10 +33,7 @@ def error_of(
 ) -> tuple[float, float]:
     """Tracer RMSE [mm], infinite if it diverges, and core seconds of a scene."""
     scene = settings.scene(name)
-    arrays, _ = read_arrays(Path(settings.data_root) / name / "truth.h5", only=("tracers", "frames"))
-    tracers = torch.from_numpy(arrays["tracers"])
-    tracers = tracers[:, :: max(1, tracers.shape[1] // TRACERS)].contiguous()
-    frames = [int(n) for n in arrays["frames"]]
+    tracers, frames = true_tracers(settings, name)
     factor = Fraction(substeps * math.ceil(grid / settings.simulation.grid))
     if courant:
         given = MPM(grid, scene.dt).courant(analytic_law(scene.law.plain(), scene.dt), scene.density)

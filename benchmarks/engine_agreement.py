@@ -10,8 +10,6 @@ Free motion: 1,728 particles in cells of 25 mm stretch and shear. Every motion i
 export` writes. Folders with a motion are not played again.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from dataclasses import replace
@@ -39,8 +37,7 @@ CONSTANTS = {
     "fluid_projection": {},
     "viscous_flow": {"viscosity": 4.0},
 }
-STEPS = {"genesis": 5e-4, "newton": 1e-3}
-"""Time step of free motion [s]."""
+STEPS = {"genesis": 5e-4, "newton": 1e-3}  # time step of free motion [s]
 DROPS = {  # elasticity and time step [s] of each engine
     "genesis": ("neo_hookean", 5e-4),
     "newton": ("hencky", 2e-3),

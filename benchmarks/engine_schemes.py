@@ -9,8 +9,6 @@ and stress a cell, and implicit steps. The start is that of `benchmarks.engine_a
 0.1 m.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -25,8 +23,7 @@ from benchmarks.engine_agreement import cube, millimetres, ours, played, spec_of
 from neuma_lib.export.scenes import EngineScene, export_scene
 from neuma_lib.mechanics.catalogue import lame
 
-Return = Callable[[np.ndarray], np.ndarray]
-"""Trial deformation gradients (N, 3, 3) -> elastic ones."""
+Return = Callable[[np.ndarray], np.ndarray]  # trial deformation gradients (N, 3, 3) -> elastic ones
 ITERATIONS, TOLERANCE = 500, 1e-7
 """Of the fixed point of an implicit step: their largest number, and largest change of a velocity [m/s]."""
 

@@ -1,6 +1,6 @@
 """The rasterizer of the gsplat package (1.5.3), for comparison, on CUDA in float32.
 
-gsplat is imported at the first call. Projection, colours, blur, near plane and depth order follow our conventions.
+Projection, colours, blur, near plane and depth order follow our conventions.
 Constants in the kernels of gsplat:
 
 - alpha below 1/255 is ignored, as by default here;
@@ -9,59 +9,23 @@ Constants in the kernels of gsplat:
 - a splat ends 3.33 standard deviations from its centre, where an opacity of 1 gives 1/255.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch
 
-from neuma_lib.errors import InputError
-from neuma_lib.splatting.compositing import Settings
 from neuma_lib.splatting.projection import NEAR_PLANE
-
-ALPHA_MIN = 1.0 / 255.0
-TRANSMITTANCE_MIN = 1e-4
 
 
 def rasterize(
-    means,
-    covars,
-    opacities,
-    sh,
-    viewmats,
-    Ks,
-    width,
-    height,
-    background=(1.0, 1.0, 1.0),
-    alpha_min=ALPHA_MIN,
-    alpha_max=None,
-    transmittance_min=TRANSMITTANCE_MIN,
-    eps2d=0.3,
+    means, covars, opacities, sh, viewmats, Ks, width, height, background=(1.0, 1.0, 1.0), alpha_max=None
 ):
     """Images (T, V, H, W, 3) and alphas (T, V, H, W); arguments as of `neuma_lib.splatting.rasterizer.rasterize`.
 
     ``alpha_max`` has no effect (see above).
-
-    Raises:
-        InputError: gsplat is not installed, or a threshold is not the one that gsplat fixes.
     """
-    settings = Settings(int(width), int(height), alpha_min, 0.999, transmittance_min, eps2d)
+    import gsplat  # no other benchmark needs it
+
     background = torch.as_tensor(background, dtype=means.dtype, device=means.device)
-    try:
-        import gsplat
-    except ImportError as error:
-        problem = f"gsplat cannot be imported: {error}"
-        remedy = "Install gsplat==1.5.3 and a CUDA compiler, or omit the compositor"
-        raise InputError("rasterize: compositor", problem, remedy) from error
-    if not (
-        math.isclose(settings.alpha_min, ALPHA_MIN)
-        and math.isclose(settings.transmittance_min, TRANSMITTANCE_MIN)
-    ):
-        raise InputError(
-            "rasterize: alpha_min, transmittance_min",
-            "the compositor 'gsplat' requires 1/255 and 1e-4, not "
-            f"{settings.alpha_min:g} and {settings.transmittance_min:g}",
-        )
     T, G, V = means.shape[0], means.shape[1], viewmats.shape[0]
     # quaternions and scales are unused if covariances are given
     images, alphas, _ = gsplat.rasterization(
@@ -72,10 +36,10 @@ def rasterize(
         sh.expand(T, *sh.shape),
         viewmats.expand(T, V, 4, 4),
         Ks.expand(T, V, 3, 3),
-        settings.width,
-        settings.height,
+        width,
+        height,
         near_plane=NEAR_PLANE,
-        eps2d=settings.eps2d,
+        eps2d=0.3,
         sh_degree=math.isqrt(sh.shape[1]) - 1,
         packed=False,
         backgrounds=background.expand(T, V, 3),

@@ -9,8 +9,6 @@ Dataset and reconstruction must exist (`snakemake results/SCENE/velocity.json`).
 comparison reads the truth. Settings are to be tuned on draws that are not reported.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import multiprocessing
@@ -28,22 +26,22 @@ from benchmarks.project_scenes import (
     refined_bodies,
     scene_parser,
     simulator,
+    true_tracers,
 )
 from benchmarks.timing import core_seconds
 from neuma_lib.config.identify import IdentifyConfig
 from neuma_lib.evaluation.metrics import tracer_errors
-from neuma_lib.fitting.identified import FamilyFit, Identified
+from neuma_lib.fitting.identified import Identified
 from neuma_lib.fitting.identify import identify
 from neuma_lib.io.files import write_json
-from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.images import load_observation
 from neuma_lib.mechanics.analytic import analytic_law
-from neuma_lib.mechanics.combinations import named_combinations, physical
+from neuma_lib.mechanics.combinations import constants_of, physical
+from neuma_lib.paper.identified_table import MATERIAL, compare_family, compare_quantities, right_families
 from neuma_lib.project.loading import merged
 from neuma_lib.project.settings import Config
 from neuma_lib.sim.prediction import predict
 
-TRACERS = 2000  # of the truth's, for the motion
 COVERED = 2.0  # standard deviations
 CLOSE = 0.1  # relative error
 
@@ -62,20 +60,19 @@ def evaluate(job: tuple[str, Config, Mapping[str, Any]]) -> dict[str, Any]:
     identified = identify(model, motion, body, video, chosen, prior_of(settings, scene), refined=refined)
     seconds = core_seconds() - before
     truth = scene.law.plain()
+    record = identified.as_dict()
     row = {
         "scene": name,
         "truth": truth,
         "core_seconds": seconds,
-        **_family(identified, truth),
-        "quantities": _quantities(identified.best, identified, truth),
-        "material": _quantities(identified.material, identified, truth) if identified.material else {},
+        "family_is": compare_family(record, truth) if right_families(record, truth) else None,
+        "quantities": compare_quantities(record, truth),
+        "material": compare_quantities(record, truth, MATERIAL),
         "combinations": _combinations(identified, truth),
-        "found": identified.as_dict(),
+        "found": record,
     }
-    arrays, _ = read_arrays(data / "truth.h5", required=("tracers",), only=("tracers",))
-    tracers = torch.from_numpy(arrays["tracers"])
-    tracers = tracers[:, :: max(1, tracers.shape[1] // TRACERS)].to(body.x0)
-    laws = {"identified": row["found"]["law"], "true_law": truth}
+    tracers = true_tracers(settings, name)[0].to(body.x0)
+    laws = {"identified": record["law"], "true_law": truth}
     starts = {"velocity": motion, "fitted": identified.best.motions[0]}
     for (law, spec), (start, initial) in product(laws.items(), starts.items()):
         state = initial.of_body(body)
@@ -84,49 +81,9 @@ def evaluate(job: tuple[str, Config, Mapping[str, Any]]) -> dict[str, Any]:
     return row
 
 
-def _kind(spec: Mapping[str, Any]) -> tuple[str, str]:
-    return spec["elasticity"]["name"], (spec.get("plasticity") or {"name": "identity"})["name"]
-
-
-def _family(identified: Identified, truth: Mapping[str, Any]) -> dict[str, Any]:
-    """Whether the family is right, or tied with the right one; None if the truth is no candidate."""
-    kinds = {name: _kind(fit.family.spec) for name, fit in identified.fits.items()}
-    right = [name for name, kind in kinds.items() if kind == _kind(truth) and "bingham" not in name]
-    ok = None
-    if right:
-        ok = (
-            "right"
-            if identified.best.family.name in right
-            else "tie"
-            if set(right) & set(identified.ties)
-            else "wrong"
-        )
-    return {"family": identified.best.family.name, "ties": identified.ties, "family_is": ok}
-
-
-def _constants(spec: Mapping[str, Any]) -> dict[str, float]:
-    return {key: float(value) for part in spec.values() for key, value in part.items() if key != "name"}
-
-
-def _quantities(fit: FamilyFit, identified: Identified, truth: Mapping[str, Any]) -> dict[str, Any]:
-    """Named combinations that also exist in the truth: value, truth, standard deviation of the logarithm, z score."""
-    true = named_combinations(_constants(truth))
-    return {
-        key: {
-            "value": value,
-            "truth": true[key],
-            "log_std": std,
-            "z": math.log(value / true[key]) / std,
-            "determined": std < identified.settings.determined,
-        }
-        for key, value, std in fit.quantities(identified.settings)
-        if key in true
-    }
-
-
 def _combinations(identified: Identified, truth: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The same of combinations whose errors are independent, if the truth has all of the constants."""
-    true = physical(_constants(truth))
+    """Combinations whose errors are independent, if the truth has all of the constants."""
+    true = physical(constants_of(truth))
     if set(true) != set(physical(identified.best.values)):
         return []
     rows = []
@@ -134,7 +91,7 @@ def _combinations(identified: Identified, truth: Mapping[str, Any]) -> list[dict
         error = entry["log_value"] - sum(
             power * math.log(true[key]) for key, power in entry["powers"].items()
         )
-        rows.append({**entry, "log_error": error, "z": error / entry["log_std"]})
+        rows.append({**entry, "log_error": error, "error_in_std": error / entry["log_std"]})
     return rows
 
 
@@ -142,12 +99,12 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> str:
     """Coverage, closeness, choice of family, motion and time over scenes, as lines."""
     lines = []
     for kind in ("quantities", "material", "combinations"):
-        entries = [e for row in rows for e in (row[kind] if kind == "combinations" else row[kind].values())]
+        entries = [e for row in rows for e in row[kind]]
         sure = [e for e in entries if e["determined"]]
         if sure:
-            covered = sum(abs(e["z"]) < COVERED for e in sure)
-            close = sum(abs(e["z"] * e["log_std"]) < math.log(1 + CLOSE) for e in sure)
-            rms = math.sqrt(sum(e["z"] ** 2 for e in sure) / len(sure))
+            covered = sum(abs(e["error_in_std"]) < COVERED for e in sure)
+            close = sum(abs(e["error_in_std"] * e["log_std"]) < math.log(1 + CLOSE) for e in sure)
+            rms = math.sqrt(sum(e["error_in_std"] ** 2 for e in sure) / len(sure))
             lines.append(
                 f"{kind}: {len(sure)} of {len(entries)} determined, truth within {COVERED:g} standard deviations in "
                 f"{covered}, within {CLOSE:.0%} in {close}, rms z {rms:.2f}"
@@ -163,17 +120,17 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> str:
 
 def lines_of(row: Mapping[str, Any]) -> str:
     """Readable lines of a scene."""
-    ties = f" (tie with {', '.join(row['ties'])})" if row["ties"] else ""
+    record = row["found"]
+    ties = f" (tie with {', '.join(record['ties'])})" if record["ties"] else ""
     lines = [
-        f"{row['scene']}: {row['family']}{ties}, {row['family_is'] or 'truth is no candidate'}; "
-        f"{row['found']['rollouts']} rollouts, {row['core_seconds']:.0f} core s; "
+        f"{row['scene']}: {record['family']}{ties}, {row['family_is'] or 'truth is no candidate'}; "
+        f"{record['rollouts']} rollouts, {row['core_seconds']:.0f} core s; "
         + ", ".join(f"{key[5:]} {value:.2f}" for key, value in row.items() if key.startswith("rmse"))
     ]
-    both = [(of, *item) for of in ("quantities", "material") for item in row[of].items()]
-    for of, key, e in both:
+    for of, e in [("quantities", e) for e in row["quantities"]] + [("material", e) for e in row["material"]]:
         lines.append(
-            f"    {of:10} {key:16} {e['value']:10.4g} true {e['truth']:10.4g} ({e['value'] / e['truth'] - 1:+.0%}) "
-            f"log std {e['log_std']:.3f} z {e['z']:+.1f} {'determined' if e['determined'] else ''}"
+            f"    {of:10} {e['quantity']:16} {e['value']:10.4g} true {e['truth']:10.4g} ({e['error_percent']:+.0f}%) "
+            f"log std {e['log_std']:.3f} z {e['error_in_std']:+.1f} {'determined' if e['determined'] else ''}"
         )
     return "\n".join(lines)
 

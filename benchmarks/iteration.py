@@ -11,8 +11,6 @@ copy, and that of the operations of its networks at the rate of a matrix product
 rasterizer are also compared with plain torch code under autograd, at a size for which that is possible.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import statistics
@@ -43,8 +41,7 @@ from neuma_lib.sim.workspace import SORT_EVERY, free_pool
 from neuma_lib.splatting.image_loss import mean_squared_error
 from neuma_lib.splatting.rasterizer import rasterize
 
-NETWORK = 2 * (13 * 64 + 64 * 64 + 64 * 9)
-"""Operations of one network for one particle, forward."""
+NETWORK = 2 * (13 * 64 + 64 * 64 + 64 * 9)  # operations of one network for one particle, forward
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,8 +12,6 @@ the best and the median time of some frames. Other load affects all wall times a
 column uses the latter: the share of real time of the steps that fit, with one picture, into 0.1 s of one core.
 """
 
-from __future__ import annotations
-
 import statistics
 import time
 from collections.abc import Callable
@@ -37,10 +35,8 @@ from neuma_lib.viewer.live import FRAME, LiveSimulation, Snapshot
 
 WARM = 4.0
 """Seconds before anything is measured: kernels are loaded, and the number of steps a frame settles."""
-FRAMES = 20
-"""Frames that are timed without the viewer's clock, after two that load kernels."""
-ASKED = 0.1
-"""Time of a frame at ten frames a second [s]."""
+FRAMES = 20  # frames that are timed without the viewer's clock, after two that load kernels
+ASKED = 0.1  # time of a frame at ten frames a second [s]
 
 
 def law_of(name: str, scene: BenchmarkScene) -> Law:

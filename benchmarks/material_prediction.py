@@ -8,8 +8,6 @@ fitted on, all on the grid of the prediction. Prints root mean square distances 
 and those of the material relative to the true law.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any

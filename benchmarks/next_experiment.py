@@ -15,8 +15,6 @@ after the other, until all constants are determined. Results are written after e
 skipped.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -47,7 +45,7 @@ from neuma_lib.geometry.shapes import place
 from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.io.files import read_json, write_json, write_text
 from neuma_lib.mechanics.analytic import analytic_law
-from neuma_lib.mechanics.combinations import physical
+from neuma_lib.mechanics.combinations import constants_of, physical
 from neuma_lib.project.loading import load, merged, read_yaml
 from neuma_lib.project.settings import Config
 from neuma_lib.sim.model import MPM
@@ -167,8 +165,7 @@ class Lab:
 
     def summary(self, fit: FamilyFit) -> dict[str, Any]:
         """Standard deviations, and logarithms of the ratios to the true constants where there are such."""
-        law = {key: value for part in self.law.values() for key, value in part.items() if key != "name"}
-        truth, values = physical(law), physical(fit.values)
+        truth, values = physical(constants_of(self.law)), physical(fit.values)
         errors = {key: math.log(values[key] / truth[key]) for key in values.keys() & truth.keys()}
         return {"family": fit.family.name, "std": stds(fit, self.settings.identify), "error": errors}
 
@@ -303,7 +300,7 @@ class Material:
     refused: str
 
     @classmethod
-    def of(cls, name: str, settings: Config, results: Mapping[Task, dict[str, Any]]) -> Material:
+    def of(cls, name: str, settings: Config, results: Mapping[Task, dict[str, Any]]) -> "Material":
         own = {task: result for task, result in results.items() if task.scene == name}
         pools = [result for result in own.values() if "candidates" in result]
         fits = [fit for each in pools for fit in each["candidates"] if "std" in fit]
@@ -323,11 +320,9 @@ class Material:
         """Logarithm of a measure of the best-ranked experiment of some kinds, or of all, over random launches."""
         chosen = (self.of_kinds(*kinds) if kinds else self.fits)[:1]
         launches = self.of_kinds("launch")
-        return (
-            [measure(chosen[0]) - float(np.mean([measure(fit) for fit in launches]))]
-            if chosen and launches
-            else []
-        )
+        if chosen and launches:
+            return [measure(chosen[0]) - float(np.mean([measure(fit) for fit in launches]))]
+        return []
 
     def over_best(self) -> list[float]:
         return [log_std(self.fits[0]) - min(map(log_std, self.fits))] if self.fits else []

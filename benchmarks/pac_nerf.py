@@ -9,8 +9,6 @@ family's published guess, with a modulus, yield stress or viscosity wrong by a d
 bound, see `BOUNDS`. The other constants are printed.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from typing import Any
@@ -41,12 +39,10 @@ CENTRE, RADIUS, EDGE = (0.5, 0.25, 0.5), 0.08, 0.025
 """Of the ball, and how wide its edge is [m]."""
 VOXEL, NODES = 0.025, 17
 MIN_OPACITY = 1e-3
-TRUTH_SPACING = 0.75
-"""Side of a cell that holds one particle of the truth [voxels]; 1 in the fit."""
+TRUTH_SPACING = 0.75  # side of a cell that holds one particle of the truth [voxels]; 1 in the fit
 STEPS, STEPS_A_FRAME = 200, 8
 PIXELS = 32
-SMALL = {"particles": 400, "followed": 8}
-"""Settings that a small body changes."""
+SMALL = {"particles": 400, "followed": 8}  # settings that a small body changes
 TRUTHS: dict[str, dict[str, float]] = {
     "elastic": {"E": 3.16e4, "nu": 0.35},
     "plasticine": {"E": 1e5, "nu": 0.35, "yield_stress": 5e3},

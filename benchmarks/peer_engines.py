@@ -4,8 +4,6 @@ As a script it serves one engine to its parent: it imports `neuma_lib` from the 
 former one, and neither needs the other's files.
 """
 
-from __future__ import annotations
-
 import sys
 import time
 from abc import ABC, abstractmethod

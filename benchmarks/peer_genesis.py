@@ -3,8 +3,6 @@
 Genesis allocates a grid for each step that it differentiates, so that forward runs in another scene.
 """
 
-from __future__ import annotations
-
 import genesis as gs
 import numpy as np
 import torch
@@ -12,8 +10,7 @@ import torch
 from benchmarks.peer_engines import Case, Rollout
 from neuma_lib.export.materials import engine_material
 
-PADDING = 3
-"""Cells at the walls of its domain that Genesis does not use."""
+PADDING = 3  # cells at the walls of its domain that Genesis does not use
 
 
 class GenesisRollout(Rollout):

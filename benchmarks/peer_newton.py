@@ -1,7 +1,5 @@
 """Rollout of a case in the implicit MPM solver of newton, which has no gradient."""
 
-from __future__ import annotations
-
 import newton
 import numpy as np
 import warp as wp

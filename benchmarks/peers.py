@@ -16,8 +16,6 @@ approximately the same positions.
 Times on a CPU are core seconds, which load disturbs less than wall time. A ratio above 1 is slower than this checkout.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import subprocess

@@ -1,13 +1,12 @@
 """Scenes of a project for benchmarks: arguments that select them, settings and files."""
 
-from __future__ import annotations
-
 import argparse
 from functools import reduce
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from benchmarks.timing import parser_of
 from neuma_lib.config.identify import IdentifyConfig
@@ -16,11 +15,14 @@ from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.io.files import read_json
+from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.mesh import read_mesh
 from neuma_lib.io.particles import load_reconstruction
 from neuma_lib.project.loading import load, merged, read_yaml
 from neuma_lib.project.settings import Config
 from neuma_lib.sim.model import MPM
+
+TRACERS = 2000  # of the truth, with which motions are compared
 
 
 def scene_parser(description: str, nargs: str) -> argparse.ArgumentParser:
@@ -62,6 +64,14 @@ def simulation(settings: Config, scene: SceneConfig) -> dict[str, Any]:
 def simulator(settings: Config, scene: SceneConfig) -> MPM:
     """The simulator for a scene's reconstruction."""
     return MPM(**simulation(settings, scene))
+
+
+def true_tracers(settings: Config, name: str) -> tuple[Tensor, list[int]]:
+    """At most about `TRACERS` evenly chosen tracers (T, M, 3) [m] of the true motion, and the steps of its frames."""
+    names = ("tracers", "frames")
+    arrays, _ = read_arrays(Path(settings.data_root) / name / "truth.h5", required=names, only=names)
+    tracers = torch.from_numpy(arrays["tracers"])
+    return tracers[:, :: max(1, tracers.shape[1] // TRACERS)].contiguous(), arrays["frames"].tolist()
 
 
 def read_body(

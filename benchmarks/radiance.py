@@ -7,8 +7,6 @@ A scene may be named by the beginning of its name. Its images must exist: `snake
 Settings are to be tuned on draws that are not reported.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

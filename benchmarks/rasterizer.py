@@ -10,8 +10,6 @@ away, where the ball covers three eighths of the image's width. A stage runs sev
 in training, measured by the clock of the device. The last rows compare one image with that of the CPU in float64.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable

@@ -10,8 +10,6 @@ The rollout is compared with the same kernels under one autograd function per st
 differentiable simulator. The best of several repetitions counts: other load only adds time.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable

@@ -8,8 +8,6 @@ grid and steps are measured on simulation and networks alone, frames and resolut
 scaling.csv and scaling.png, and prints the exponent p of time ~ size^p between the two largest sizes.
 """
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import gc

@@ -4,8 +4,6 @@ Nothing is read from disk, so that a benchmark needs no results. The ball deform
 change cells and neighbours, Gaussians stretch.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -9,8 +9,6 @@ closed form and Warp's by its own adjoint of ``svd3``; the error is that of thei
 against central differences of LAPACK in float64, over the norms of both.
 """
 
-from __future__ import annotations
-
 import torch
 import warp as wp
 

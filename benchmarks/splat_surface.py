@@ -10,8 +10,6 @@ points on either surface to the other, and the volume over the true one, from si
 Gaussians with an unknown surface it prints both volumes.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import time
@@ -29,10 +27,8 @@ from neuma_lib.geometry.splat_surface import splat_surface, views_around
 from neuma_lib.io.gaussians import load_gaussians
 from neuma_lib.splatting.gaussians import Gaussians, quaternions
 
-SIZE = 0.4
-"""Longest side [m]."""
-SAMPLES = 20_000
-"""Points on a surface that distances are measured at."""
+SIZE = 0.4  # longest side [m]
+SAMPLES = 20_000  # points on a surface that distances are measured at
 
 
 def bowl() -> trimesh.Trimesh:
@@ -100,10 +96,8 @@ def between(a: trimesh.Trimesh, b: trimesh.Trimesh) -> np.ndarray:
 def compare(
     name: str, gaussians: Gaussians, truth: trimesh.Trimesh | None, chosen: argparse.Namespace
 ) -> None:
-    cameras, settings = (
-        views_around(gaussians, chosen.views, chosen.pixels),
-        SurfaceConfig(resolution=chosen.voxels),
-    )
+    cameras = views_around(gaussians, chosen.views, chosen.pixels)
+    settings = SurfaceConfig(resolution=chosen.voxels)
     for dents in (False, True):
         began = time.process_time()
         surface = splat_surface(gaussians, cameras, settings, dents=dents)

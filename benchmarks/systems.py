@@ -9,18 +9,15 @@ results/SCENE/velocity.json`). A radiance field that is missing (`.../pac_nerf/f
 the folder of --fields. Only the comparison reads the truth. Tune settings on scenes that are not reported.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import torch
 
-from benchmarks.project_scenes import chosen_scenes, scene_parser, simulation, simulator
+from benchmarks.project_scenes import chosen_scenes, scene_parser, simulation, simulator, true_tracers
 from benchmarks.timing import core_seconds
 from neuma_lib.evaluation.metrics import tracer_errors
 from neuma_lib.io.checkpoint import Checkpoint
-from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.images import load_views
 from neuma_lib.io.particles import load_initial_state
 from neuma_lib.methods.base import FitRun, Problem, body_of_each_video
@@ -28,8 +25,6 @@ from neuma_lib.methods.pac_nerf.field_fit import fit_radiance_field
 from neuma_lib.methods.pac_nerf.io import save_field
 from neuma_lib.project import cases
 from neuma_lib.project.settings import Config
-
-TRACERS = 2000  # of the truth, for the motion
 
 
 class Run(FitRun):
@@ -78,13 +73,11 @@ def measure(name: str, settings: Config, method: str, fields: Path) -> str:
 
 def _errors(case, start: str, settings: Config, model):
     """Errors of tracers that start as those of the truth, and how the prediction failed, if it did."""
-    truth = case.data("truth.h5")
-    arrays, _ = read_arrays(truth, required=("tracers", "frames"), only=("tracers", "frames"))
-    tracers = torch.from_numpy(arrays["tracers"]).to(torch.float32)
-    tracers = tracers[:, :: max(1, tracers.shape[1] // TRACERS)]
+    tracers, frames = true_tracers(settings, case.scene)
+    tracers = tracers.to(torch.float32)
     state, _ = load_initial_state(*body_of_each_video(case).values(), start, case.densities)
     mpm = simulator(settings, settings.scene(case.scene))
-    path, failure = model.predict(mpm, state, tuple(arrays["frames"].tolist()), tracers[0])
+    path, failure = model.predict(mpm, state, tuple(frames), tracers[0])
     return tracer_errors(path.tracers, tracers), failure
 
 

@@ -7,8 +7,6 @@ process: the first time includes work that a process does once (start of CUDA, l
 exclude each other and end when the device is idle. On a CPU they are core seconds, which hardly depend on other load.
 """
 
-from __future__ import annotations
-
 import json
 import time
 from collections import Counter
@@ -48,10 +46,7 @@ IDENTIFYING = {
     "linearising": (FamilyRun, "linearise"),
     "uncertainties": (FamilyRun, "_covariance"),
 }
-CORRECTING = {
-    "training": (structured_fit, "train_material"),
-    "scoring": (structured_fit, "_simulate"),
-}
+CORRECTING = {"training": (structured_fit, "train_material"), "scoring": (structured_fit, "_simulate")}
 
 
 class Clock:

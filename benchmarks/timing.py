@@ -1,7 +1,5 @@
 """Time and memory of work on a device, the limits of the device, and the parser of a benchmark's arguments."""
 
-from __future__ import annotations
-
 import argparse
 import resource
 import time

@@ -1,7 +1,5 @@
 """Reference rasterizer in plain torch with autograd, slow, to test the kernels."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

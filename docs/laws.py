@@ -4,8 +4,6 @@ Equations are the docstrings of the classes, constants are those of `neuma_lib.m
 computed with the laws.
 """
 
-from __future__ import annotations
-
 import inspect
 import io
 import math
@@ -43,10 +41,8 @@ EXAMPLES: dict[str, dict[str, float]] = {
     "cohesive_drucker_prager": {"friction_angle": 30.0, "cohesion": 4e3, "dilation_angle": 10.0},
 }
 """Constants of the pictures. Laws without constants but E and nu need none."""
-DT = 1e-3
-"""Time step of the pictures of return maps [s], of which loading has 60."""
-LARGEST = 0.3
-"""Largest logarithmic strain of the curves."""
+DT = 1e-3  # time step of the pictures of return maps [s], of which loading has 60
+LARGEST = 0.3  # largest logarithmic strain of the curves
 
 INTRODUCTION = """\
 # Gallery of laws

@@ -7,8 +7,6 @@ The first line of a recorded table names date, commit, grid and machine. `docs.r
 pages. The text `figures` of docs/results/figures.md is generated here, from files that are not copied.
 """
 
-from __future__ import annotations
-
 import argparse
 import datetime
 import platform
@@ -27,8 +25,7 @@ from neuma_lib.paper.figures import image_quality, lora_alphav, material_respons
 from neuma_lib.paper.image_grid import load_image_grid
 from neuma_lib.project import loading
 
-WIDTH = 1400
-"""Of figures on a page [px]; in print they are larger."""
+WIDTH = 1400  # of figures on a page [px]; in print they are larger
 
 
 def processor() -> str:

@@ -6,8 +6,6 @@ METHOD and COLUMN are words in it, and a fourth word is the quantity, by default
 `<!-- /name -->` the text of one of `PLACES`.
 """
 
-from __future__ import annotations
-
 import csv
 import re
 from collections.abc import Iterator
@@ -44,8 +42,7 @@ MADE_BY = {
     "table2_systems": "results/table2_systems.csv",
 }
 """Tables that are recorded, and the target of Snakemake that makes them."""
-VERDICT_HEAD = f"| {' | '.join(VERDICTS[:2])} |"
-"""How the head of a table of verdicts begins."""
+VERDICT_HEAD = f"| {' | '.join(VERDICTS[:2])} |"  # how the head of a table of verdicts begins
 METHODS = {
     "nclaw": "prior",
     "neuma": "NeuMA",

@@ -13,8 +13,6 @@ replaces dependencies by their newest versions. Local builds (``+cpu``) and the 
 out, so that the files resolve anywhere.
 """
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

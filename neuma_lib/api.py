@@ -1,7 +1,5 @@
 """Scenes in memory: what is fitted to them, rendered and evaluated. `neuma_lib` exports these names."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -70,7 +68,7 @@ class Video:
         *,
         dt: float | None = None,
         exposure_samples: int = EXPOSURE_SAMPLES,
-    ) -> Video:
+    ) -> "Video":
         """Read the frames of some views.
 
         Args:
@@ -97,7 +95,7 @@ class Video:
         """Steps of all frames, ascending."""
         return tuple(sorted({step for each in self.observations for step in each.frames}))
 
-    def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> Video:
+    def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> "Video":
         """Copy to another precision or device."""
         return Video(tuple(each.to(dtype, device) for each in self.observations))
 
@@ -121,7 +119,7 @@ class Scene:
     truth: Trajectory | None = None
 
     @classmethod
-    def load(cls, folder: str | Path, *, views: Sequence[int] = (0,)) -> Scene:
+    def load(cls, folder: str | Path, *, views: Sequence[int] = (0,)) -> "Scene":
         """Read a folder of results, with the settings and data of its project.
 
         Args:
@@ -277,11 +275,8 @@ def identify(
     }
     settings = validate(IdentifyConfig, values, "options")
     if settings.refined_particles:
-        raise InputError(
-            "options.refined_particles",
-            f"{settings.refined_particles} must be 0",
-            "Use the workflow to correct it",
-        )
+        problem = f"{settings.refined_particles} must be 0"
+        raise InputError("options.refined_particles", problem, "Use the workflow to correct it")
     body = replace(scene.reconstruction, affine=settings.gaussian_motion == "affine")
     video = _video(scene)
     motion = scene.motion or estimate_motion(body, video, scene.mpm)

@@ -7,8 +7,6 @@ params.code     digest of the script, of the library modules behind it, and of o
 resources       `RESOURCES`, and one thread (Snakemake's own default)
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection
 from pathlib import Path
 

@@ -27,9 +27,8 @@ def image_list(place: str, stride: int | None, key: str, stride_key: str) -> str
             raise InputError(key, f"the folder {place} has {content}", "Give the file that lists the images")
         place = f"{place.rstrip('/')}/{lists[0]}"
     if Path(place).name in COUNTED and stride is None:
-        raise InputError(
-            stride_key, f"missing, but {place} numbers frames", "Give the simulated steps between two frames"
-        )
+        problem = f"missing, but {place} numbers frames"
+        raise InputError(stride_key, problem, "Give the simulated steps between two frames")
     return place
 
 

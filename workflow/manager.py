@@ -4,8 +4,6 @@ A Snakemake that is killed (SIGKILL, out of memory) cannot stop its jobs, and a 
 same time. A script therefore watches the outermost Snakemake above it and ends with it. Its checkpoint keeps the work.
 """
 
-from __future__ import annotations
-
 import os
 import threading
 import time

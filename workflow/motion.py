@@ -1,7 +1,5 @@
 """The method of a job, its files and its model, for scripts of fits and predictions."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -120,9 +118,8 @@ class Prediction:
         """The law of a job about one law. Raises InputError if the motion follows from no law."""
         law = self.model(dt).law
         if law is None:
-            raise InputError(
-                self.method.name, "its motion follows from no material law", "Choose another method"
-            )
+            problem = "its motion follows from no material law"
+            raise InputError(self.method.name, problem, "Choose another method")
         return law
 
     def body(self, density, particle_source: str, gaussian_motion: str, device: torch.device):

@@ -1,7 +1,5 @@
 """One line a finished job on the terminal, in place of Snakemake's blocks. Snakemake's log file keeps them."""
 
-from __future__ import annotations
-
 import atexit
 import logging
 import os

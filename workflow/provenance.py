@@ -7,8 +7,6 @@ and data files of the same stem (``compositor.cu`` next to ``compositor.py``). `
 a.b.c if there is one, else a.b; the ``__init__`` of a package counts only where a name is imported from it.
 """
 
-from __future__ import annotations
-
 import ast
 import hashlib
 import json

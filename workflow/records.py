@@ -1,7 +1,5 @@
 """Patches of Snakemake: records of failed jobs, deleted folders of results, and the limit of jobs a second."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from snakemake.persistence import PersistenceBase

@@ -7,8 +7,6 @@ Several stages may share a terminal. The one that holds a lock on it draws a mov
 without a terminal, print a plain line every 15 seconds.
 """
 
-from __future__ import annotations
-
 import fcntl
 import gc
 import logging
@@ -40,13 +38,12 @@ LOG_FORMAT = "[%(asctime)s] %(message)s"
 
 _LOGGER = logging.getLogger("neuma_lib.stage")
 _LOG_LOGGER = logging.getLogger("neuma_lib.log")  # for the log alone
-_USED = (
-    "core seconds: {:.2f} to start, {:.2f} of work; memory: {:.1f} MB"  # read by neuma_lib.project.timings
-)
+# read by neuma_lib.project.timings
+_USED = "core seconds: {:.2f} to start, {:.2f} of work; memory: {:.1f} MB"
 
 
 @contextmanager
-def stage(name: str, log: str | Path | None = None, stream: TextIO | None = None) -> Iterator[Stage]:
+def stage(name: str, log: str | Path | None = None, stream: TextIO | None = None) -> "Iterator[Stage]":
     """Run a stage: ``with stage("material BouncyBall/neuma", snakemake.log[0]) as run: ...``. One a process.
 
     Args:

@@ -1,7 +1,5 @@
 """Targets that no rule makes, with the nearest ones that can be made."""
 
-from __future__ import annotations
-
 import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
@@ -50,11 +48,8 @@ def refuse_unknown(
         tried = dict.fromkeys("/".join(parts) for parts in islice(product(*options), _TRIED))
         near = [path for path in tried if exists(path)][:3]
         if missing := settings_of(target):
-            raise InputError(
-                target,
-                "no rule makes this file with these settings",
-                f"Add --configfile {' '.join(missing)} --",
-            )
+            problem = "no rule makes this file with these settings"
+            raise InputError(target, problem, f"Add --configfile {' '.join(missing)} --")
         if odd := [part for part in Path(target).parts[1:-1] if not _PLAIN.fullmatch(part)]:
             raise InputError(
                 target,

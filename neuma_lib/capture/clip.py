@@ -6,8 +6,6 @@ the width and the level of the camera together. The silhouettes show whether the
 ball that rebounds shows its stiffness, or a lower bound of it. Other constants need photographs (docs/capture.md).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -131,11 +129,10 @@ def analyse_clip(video: str | Path, folder: str | Path, diameter: float | None =
     def draw(path: Path, masks: np.ndarray | None = None, text: str = "") -> None:
         used = np.arange(len(window)) if masks is None else np.flatnonzero(masks.any(axis=(1, 2)))
         frames = [Frame(int(window[k]), float(times[k]), pictures[k]) for k in used[sheet_numbers(len(used))]]
-        sheet = (
-            frames
-            if masks is None
-            else [overlay(f, masks[np.searchsorted(window, f.number)]) for f in frames]
-        )
+        if masks is None:
+            sheet = frames
+        else:
+            sheet = [overlay(f, masks[np.searchsorted(window, f.number)]) for f in frames]
         contact_sheet(path, sheet, f"{video.name}{text}")
 
     with evidence(folder / "masks.png", draw):

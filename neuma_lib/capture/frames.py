@@ -7,8 +7,6 @@ OpenCV, it reports whether a frame has a time stamp, in ticks of the file's cloc
 phone.
 """
 
-from __future__ import annotations
-
 import re
 import subprocess
 import tempfile
@@ -176,11 +174,8 @@ def check_times(times: Sequence[float], path: str | Path) -> np.ndarray:
     back = np.flatnonzero(np.diff(times) <= 0)
     if len(back):
         i = int(back[0])
-        raise InputError(
-            path,
-            f"times decrease from frame {i} ({times[i]:.4f} s) to frame {i + 1} ({times[i + 1]:.4f} s)",
-            _ORIGINAL,
-        )
+        problem = f"times decrease from frame {i} ({times[i]:.4f} s) to frame {i + 1} ({times[i + 1]:.4f} s)"
+        raise InputError(path, problem, _ORIGINAL)
     return times
 
 

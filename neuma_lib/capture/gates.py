@@ -4,8 +4,6 @@ Later stages accept anything: a body with a chair in it moves and is fitted, too
 limit that good captures exceed by far, and states what to do.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -75,11 +73,9 @@ def check_volume(volume: float, hull: float, watertight: bool, where: str) -> No
     low, high = VOLUME_RATIO
     ratio = volume / max(hull, 1e-300)
     if not watertight or not low <= ratio <= high:
-        problem = (
-            "the surface of the object is not closed"
-            if not watertight
-            else "the volume of the surface is wrong"
-        )
+        problem = "the volume of the surface is wrong"
+        if not watertight:
+            problem = "the surface of the object is not closed"
         raise InputError(
             where,
             f"{problem}: {1e3 * volume:.3f} l, the visual hull of the masks has {1e3 * hull:.3f} l, a ratio of"

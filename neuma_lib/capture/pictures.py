@@ -4,8 +4,6 @@ The name of a picture is ``<group>/<file>``. Pictures keep the orientation of th
 because tools interpret it differently, and because the lens does not depend on how a phone is held.
 """
 
-from __future__ import annotations
-
 import shutil
 import struct
 from collections import Counter

@@ -17,8 +17,6 @@ The world is not metric. NeuMA's settings compensate with a frame interval of 10
 gravity by 1.44 relative to metres.
 """
 
-from __future__ import annotations
-
 import re
 import struct
 from collections.abc import Iterator, Sequence
@@ -122,10 +120,8 @@ def _spring_gaus(folder: Path, name: str, ground: float) -> Released:
     videos = {}
     for camera, files in frames.items():
         if camera not in poses:
-            raise InputError(
-                f"{folder / 'dynamic/sequences' / name / '0.json'}: {camera}",
-                f"no pose in cameras_calib.json{hint(camera, poses)}",
-            )
+            problem = f"no pose in cameras_calib.json{hint(camera, poses)}"
+            raise InputError(f"{folder / 'dynamic/sequences' / name / '0.json'}: {camera}", problem)
         pictures = [_picture(folder / "dynamic/videos_images" / camera, file) for file in files]
         masks = [_picture(folder / "dynamic/videos_masks" / camera, Path(file).stem) for file in files]
         videos[camera] = _video(pictures, masks, range(len(files)), next(iter(lens.values())), poses[camera])
@@ -280,9 +276,8 @@ def seen_size(masks: Sequence[np.ndarray], viewmats: np.ndarray, Ks: np.ndarray)
     """
     middle, radii = middle_and_radii(masks, viewmats, Ks)
     if not (radii > 0).all():
-        raise InputError(
-            "masks", "the object is behind a camera", "Check that poses and masks are of the same capture"
-        )
+        problem = "the object is behind a camera"
+        raise InputError("masks", problem, "Check that poses and masks are of the same capture")
     return middle, float(np.median(radii))
 
 

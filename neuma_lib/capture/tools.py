@@ -1,7 +1,5 @@
 """Optional packages for captures: OpenCV, COLMAP, ffmpeg and Matplotlib."""
 
-from __future__ import annotations
-
 import signal
 import threading
 from pathlib import Path
@@ -32,13 +30,13 @@ def colmap() -> ModuleType:
     return module
 
 
-def new_figure(width: float, height: float) -> Figure:
+def new_figure(width: float, height: float) -> "Figure":
     """A figure of a size [in]. Raises InputError if Matplotlib is not installed."""
     figure = require("matplotlib.figure", "capture").Figure
     return figure(figsize=(width, height), layout="constrained")
 
 
-def save_figure(path: str | Path, figure: Figure) -> None:
+def save_figure(path: str | Path, figure: "Figure") -> None:
     """Write a figure as PNG."""
     canvas = require("matplotlib.backends.backend_agg", "capture").FigureCanvasAgg(figure)
     with atomic(path) as partial:

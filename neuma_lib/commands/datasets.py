@@ -85,9 +85,8 @@ def _score(options: argparse.Namespace) -> None:
     table = options.table or ranking.find_table("docs/results", scene)
     places = ranking.places(metrics, ranking.recorded(table, scene)) if table else {}
     if options.table and not places:
-        raise InputError(
-            table, f"has no methods in the scene {scene}", "Choose another --table, or leave it out"
-        )
+        problem = f"has no methods in the scene {scene}"
+        raise InputError(table, problem, "Choose another --table, or leave it out")
     print(
         f"{scene}: {len(x)} frames, {metrics.pop('points')} points"
         + (f", compared with {table}" if table else "")

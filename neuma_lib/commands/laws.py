@@ -1,7 +1,5 @@
 """Commands ``law`` and ``scene``: laws and scenes for others."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from pathlib import Path
@@ -119,7 +117,7 @@ def _export(options: argparse.Namespace) -> None:
     print(f"{options.target}: {about['kind']}{step}" + (f"; {options.page}" if options.page else ""))
 
 
-def _export_to_engine(options: argparse.Namespace, law: Law, known: dict[str, Any]) -> None:
+def _export_to_engine(options: argparse.Namespace, law: "Law", known: dict[str, Any]) -> None:
     from neuma_lib.export.laws import law_for_engine
     from neuma_lib.export.materials import ENGINES, check_engine
     from neuma_lib.export.scenes import write_law_scene
@@ -172,9 +170,8 @@ def _scene_export(options: argparse.Namespace) -> None:
     from neuma_lib.export.scenes import EngineScene, export_scene
 
     if not Path(options.source).is_dir():
-        raise InputError(
-            options.source, "is not a folder", "Give that of a method, for example results/Ball/neuma"
-        )
+        problem = "is not a folder"
+        raise InputError(options.source, problem, "Give that of a method, for example results/Ball/neuma")
     for name in ("adaptor", "dt", "any_time_step"):
         setattr(options, name, None)
     law, known = _of_method(options)
@@ -192,18 +189,15 @@ def _scene_export(options: argparse.Namespace) -> None:
     print(f"Play it with: python {options.target}/run.py")
 
 
-def _of_method(options: argparse.Namespace) -> tuple[Law, dict[str, Any]]:
+def _of_method(options: argparse.Namespace) -> "tuple[Law, dict[str, Any]]":
     """The law of a method's folder, and what `export_law` needs to know of it."""
     from neuma_lib.evaluation.law_export import head_commit
     from neuma_lib.project import cases
     from neuma_lib.project.project import Project
 
     if options.adaptor or options.dt is not None:
-        raise InputError(
-            options.source,
-            "it is a method's folder, whose adaptor and time step are known",
-            "Leave out --adaptor and --dt",
-        )
+        problem = "it is a method's folder, whose adaptor and time step are known"
+        raise InputError(options.source, problem, "Leave out --adaptor and --dt")
     place = Path(options.source).absolute()
     settings, root = Project.find(place, options.configfile)
     settings = settings.model_copy(update={"results_root": str(place.parent.parent)})
@@ -221,7 +215,7 @@ def _of_method(options: argparse.Namespace) -> tuple[Law, dict[str, Any]]:
     return law, {**origin, **of_this, "any_time_step": options.any_time_step, "commit": head_commit(root)}
 
 
-def _of_file(options: argparse.Namespace) -> tuple[Law, dict[str, Any]]:
+def _of_file(options: argparse.Namespace) -> "tuple[Law, dict[str, Any]]":
     """The same of a file, with what an exported one already states."""
     from neuma_lib.io.exported import EXPORT, check_step, checked_export
     from neuma_lib.io.files import existing

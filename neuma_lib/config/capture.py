@@ -1,7 +1,5 @@
 """Settings of captures: `captures` of the project, and the capture.yaml of each capture."""
 
-from __future__ import annotations
-
 from pathlib import PurePosixPath, PureWindowsPath
 from typing import Annotated, Literal
 
@@ -47,7 +45,7 @@ class LengthConfig(Section):
     )
 
     @model_validator(mode="after")
-    def _between_two_objects(self) -> LengthConfig:
+    def _between_two_objects(self) -> "LengthConfig":
         if bool(self.ends) == (self.cameras is not None):
             raise ValueError("ends: mark the two points in photographs, or name two photographs as `cameras`")
         return self
@@ -171,7 +169,7 @@ class CaptureConfig(Section):
         return self.poses != "photographs" or self.board is not None or self.length is not None
 
     @model_validator(mode="after")
-    def _metres_from_somewhere(self) -> CaptureConfig:
+    def _metres_from_somewhere(self) -> "CaptureConfig":
         if self.board is None and self.poses == "board":
             raise ValueError(
                 "poses: board needs `board: {square: ...}` with the measured side of a square [m]"

@@ -55,8 +55,7 @@ class IdentifyConfig(Section):
     )
     iterations: int = internal(10, "maximum number of Levenberg-Marquardt steps for each width", ge=1)
     start_from_first_video: bool = internal(
-        False,
-        "fits to several videos also start from the constants of a fit to the first one",
+        False, "fits to several videos also start from the constants of a fit to the first one"
     )
     level_plateaus: bool = internal(
         False, "plateaus of the loss are measured above its slope where a fit ends before its minimum"

@@ -1,7 +1,5 @@
 """The binding matrix B: the weights of the particles that move a Gaussian (paper Algorithm 1)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import torch
@@ -19,7 +17,7 @@ class Binding:
     _compressed: dict = field(default_factory=dict, repr=False, compare=False)
 
     @classmethod
-    def identity(cls, count: int, like: Tensor) -> Binding:
+    def identity(cls, count: int, like: Tensor) -> "Binding":
         """One particle for each of ``count`` Gaussians (the paper's "w/o Bind"), with device and dtype of ``like``."""
         index = torch.arange(count + 1, device=like.device)
         return cls(index, index[:-1].clone(), like.new_ones(count), (count, count))
@@ -29,7 +27,7 @@ class Binding:
         """Number of bound particles of each Gaussian, int64, shape (G,)."""
         return self.indptr[1:] - self.indptr[:-1]
 
-    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Binding:
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> "Binding":
         """The same matrix on another device or with weights of another dtype."""
         values = self.values.to(device=device, dtype=dtype)
         return Binding(self.indptr.to(device), self.indices.to(device), values, self.shape)

@@ -1,7 +1,5 @@
 """Initial motion of a body with its uncertainty, which can be corrected once the material is known."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -32,14 +30,14 @@ class InitialMotion:
     std: np.ndarray
 
     @classmethod
-    def of(cls, content: Mapping[str, Any]) -> InitialMotion:
+    def of(cls, content: Mapping[str, Any]) -> "InitialMotion":
         """From the content of velocity.json. Without standard deviations the motion is exact."""
         std = [content.get(key, (0, 0, 0)) for key in ("std_camera", "angular_velocity_std_camera")]
         v0, spin, centre = (np.asarray(content[key], float) for key in ("v0", "angular_velocity", "centre"))
         axes = np.asarray(content.get("camera_axes", np.eye(3)), dtype=float)
         return cls(v0, spin, centre, axes, np.concatenate(std).astype(float))
 
-    def moved(self, deviations: np.ndarray) -> InitialMotion:
+    def moved(self, deviations: np.ndarray) -> "InitialMotion":
         """Add a deviation (6,), in units of the standard deviations."""
         velocity, spin = (self.std * deviations).reshape(2, 3) @ self.axes
         return replace(self, velocity=self.velocity + velocity, spin=self.spin + spin)

@@ -1,7 +1,5 @@
 """Tracks of markers on a body, as motion capture records them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,7 +33,7 @@ class MarkerTracks:
         if not (np.diff(self.times) > 0).all():
             raise InputError("markers", "times must increase")
 
-    def turned(self, along: str, up: str) -> MarkerTracks:
+    def turned(self, along: str, up: str) -> "MarkerTracks":
         """The same in axes x along the beam, y up and z to the right, of which two are named in those of the file.
 
         Args:
@@ -59,7 +57,7 @@ class MarkerTracks:
         """Mean positions [m] of the frames up to a time [s], shape (M, 3)."""
         return self.positions[: max(int((self.times <= release).sum()), 1)].mean(0)
 
-    def within(self, first: float, last: float) -> MarkerTracks:
+    def within(self, first: float, last: float) -> "MarkerTracks":
         """The frames of an interval of times [s]."""
         keep = (self.times >= first) & (self.times <= last)
         return MarkerTracks(self.times[keep], self.positions[keep])

@@ -5,8 +5,6 @@ Row i of the binding matrix B (G, N) contains the weights of the particles that 
 particles near a Gaussian are tested.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -142,7 +140,7 @@ class _Columns(NamedTuple):
     points: Tensor  # positions [m], column after column, ascending in z
 
     @classmethod
-    def of(cls, points: Tensor) -> _Columns:
+    def of(cls, points: Tensor) -> "_Columns":
         lower = points.amin(0)
         extent = points.amax(0) - lower
         # a square is about as wide as the particle spacing
@@ -171,7 +169,7 @@ class _Ellipsoids(NamedTuple):
     threshold: float  # maximum squared Mahalanobis distance of a bound particle
 
     @classmethod
-    def of(cls, centres: Tensor, shapes: Tensor, settings: BindingConfig) -> _Ellipsoids:
+    def of(cls, centres: Tensor, shapes: Tensor, settings: BindingConfig) -> "_Ellipsoids":
         from scipy.special import chdtri  # here, because the import takes an eighth of a second
 
         eigenvalues, eigenvectors = np.linalg.eigh(shapes.cpu().numpy())

@@ -145,9 +145,8 @@ def clamped_body(
     root, reach = _HELD + _MARGIN, float(np.linalg.norm(local, axis=1).max())
     along, above = float(local[:, 0].max()), float(local[:, 1].max())
     grid = 2 * _MARGIN + max(_HELD + math.ceil(along / dx), math.ceil((above + reach) / dx)) + 1
-    lower = (
-        grid - _MARGIN - math.ceil((above - local[first][:, 1].min()) / dx)
-    )  # node at the section's lower face
+    # node at the section's lower face
+    lower = grid - _MARGIN - math.ceil((above - local[first][:, 1].min()) / dx)
     edge = grid * dx
     centre = np.array([root * dx, lower * dx + (section[1] - section[0])[1] / 2, edge / 2])
     mass = density * volumes
@@ -222,9 +221,8 @@ def _clamped_end(body: Hexahedra, clamp: Clamp, gravity: Sequence[float] | Array
         if low[k] + slack < bound[k] < high[k] - slack
     ]
     if len(faces) != 1:
-        raise InputError(
-            "clamp", f"{len(faces)} of its faces cross the body", "Give a region that holds one end"
-        )
+        problem = f"{len(faces)} of its faces cross the body"
+        raise InputError("clamp", problem, "Give a region that holds one end")
     k, sign, plane = faces[0]
     axes = np.zeros((3, 3))
     axes[0, k] = sign

@@ -81,9 +81,8 @@ def corrected_draws(
         InputError: a law of the form "energy".
     """
     if law.elasticity.form != "stretch":
-        raise InputError(
-            "law", f'the form of the structured law is "{law.elasticity.form}", bands need "stretch"'
-        )
+        problem = f'the form of the structured law is "{law.elasticity.form}", bands need "stretch"'
+        raise InputError("law", problem)
     generator = np.random.default_rng(seed)
     field = RandomField(generator.standard_normal((FEATURES, INVARIANTS)), generator.uniform(size=FEATURES))
     states = visited.reshape(-1, 3, 3)

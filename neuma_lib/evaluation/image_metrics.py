@@ -30,9 +30,8 @@ def object_window(visible: np.ndarray, margin: float) -> tuple[slice, slice]:
     if not visible.any():
         raise InputError("image metrics", "the object is neither in the observed nor in the predicted frame")
     if min(visible.shape) < SMALLEST:
-        raise InputError(
-            "image metrics", f"an image of {visible.shape} pixels is smaller than {SMALLEST} a side"
-        )
+        problem = f"an image of {visible.shape} pixels is smaller than {SMALLEST} a side"
+        raise InputError("image metrics", problem)
     spans = [np.flatnonzero(visible.any(axis=axis)) for axis in (1, 0)]
     grow = round(margin * max(int(s[-1] - s[0]) + 1 for s in spans))
     return tuple(

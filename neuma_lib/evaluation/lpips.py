@@ -57,11 +57,8 @@ class LPIPS(nn.Module):
         for name, shape in expected_shapes(net).items():
             if name not in weights or tuple(weights[name].shape) != shape:
                 shape_here = tuple(weights[name].shape) if name in weights else "missing"
-                raise InputError(
-                    "LPIPS weights",
-                    f"{name} is {shape_here}, expected {shape}",
-                    "Build the file again with the rule lpips_weights",
-                )
+                problem = f"{name} is {shape_here}, expected {shape}"
+                raise InputError("LPIPS weights", problem, "Build the file again with the rule lpips_weights")
             self.register_buffer(name.replace(".", "_"), weights[name].float(), persistent=False)
 
     def features(self, images: Tensor) -> list[Tensor]:
@@ -89,9 +86,8 @@ class LPIPS(nn.Module):
             shapes = f"{tuple(images.shape)} and {tuple(references.shape)}"
             raise InputError("LPIPS", f"images of shapes {shapes}, expected (B, 3, H, W) twice")
         if min(images.shape[2:]) < SMALLEST:
-            raise InputError(
-                "LPIPS", f"images of {tuple(images.shape[2:])} pixels, expected {SMALLEST} a side"
-            )
+            problem = f"images of {tuple(images.shape[2:])} pixels, expected {SMALLEST} a side"
+            raise InputError("LPIPS", problem)
         total = images.new_zeros(len(images))
         for k, (a, b) in enumerate(zip(self.features(images), self.features(references), strict=True)):
             head = getattr(self, f"{self.net}_head{k}")

@@ -1,7 +1,5 @@
 """Tests of a material point: stress of a law under prescribed deformations."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -31,7 +29,7 @@ class Visited:
     pressed: float
 
     @classmethod
-    def of(cls, F: Tensor) -> Visited:
+    def of(cls, F: Tensor) -> "Visited":
         """Ranges of elastic deformation gradients F (..., 3, 3)."""
         sigma = torch.linalg.svdvals(F.reshape(-1, 3, 3).double())
         J = torch.linalg.det(F.reshape(-1, 3, 3).double())

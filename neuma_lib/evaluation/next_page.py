@@ -158,10 +158,7 @@ def _goal(goal: str, value: float) -> str:
 
 
 @torch.no_grad()
-def draw(
-    file: str | Path,
-    motions: Sequence[tuple[Experiment, Trajectory]],
-) -> None:
+def draw(file: str | Path, motions: Sequence[tuple[Experiment, Trajectory]]) -> None:
     """Draw a row of frames for each motion, with the edges of boxes that it touches.
 
     Args:

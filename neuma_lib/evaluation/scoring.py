@@ -45,9 +45,8 @@ def score_positions(
     """
     if len(x) != len(truth) or frames is not None and list(frames) != list(steps):
         given = f"{len(x)} frames" if frames is None else f"{len(x)} frames at steps {_ends(frames)}"
-        raise InputError(
-            "positions", f"{given} must be the {len(truth)} of the truth at steps {_ends(steps)}"
-        )
+        problem = f"{given} must be the {len(truth)} of the truth at steps {_ends(steps)}"
+        raise InputError("positions", problem)
     x, truth, truth_again = x.double(), truth.double(), truth_again.double()
     distance, same = cKDTree(x[0].numpy()).query(truth[0].numpy())
     metrics, own = {}, np.arange(x.shape[1])

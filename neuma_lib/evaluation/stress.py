@@ -7,8 +7,6 @@ strain can have the same stress. Only the stress along a path of total deformati
 updates its own elastic F from the start.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -46,7 +44,7 @@ class VisitedStates:
     frames: tuple[int, ...]
 
     @classmethod
-    def of_arrays(cls, arrays: Mapping[str, np.ndarray]) -> VisitedStates:
+    def of_arrays(cls, arrays: Mapping[str, np.ndarray]) -> "VisitedStates":
         """Inverse of `arrays`."""
         values = (torch.from_numpy(arrays[name]) for name in ("F", "F_trial", "C"))
         return cls(*values, tuple(arrays["frames"].tolist()))

@@ -31,9 +31,8 @@ def side_by_side(panels: Sequence[np.ndarray], labels: Sequence[str], magnify: i
     """
     panels = [_as_bytes(panel) for panel in panels]
     if len({panel.shape[:2] for panel in panels}) != 1:
-        raise InputError(
-            "side_by_side", f"videos of shapes {[p.shape for p in panels]} differ in length or height"
-        )
+        problem = f"videos of shapes {[p.shape for p in panels]} differ in length or height"
+        raise InputError("side_by_side", problem)
     if len(labels) != len(panels):
         raise InputError("side_by_side", f"{len(labels)} labels for {len(panels)} videos")
     columns = []

@@ -127,7 +127,6 @@ def _fitted(law: Law, known, engine: str, states: Tensor | None, force: bool, su
         names, percent = " + ".join(part["name"] for part in fit.spec.values()), 100 * fit.error
         problem = f"the nearest law of {engine}, {names}, has a stress error of {percent:.0f} % over the visited states"
         limit = f"more than {100 * MAX_ERROR:.0f} %"
-        raise InputError(
-            f"law {law.name}", f"{problem}, {limit}", "Accept it with --force, or choose another engine"
-        )
+        problem = f"{problem}, {limit}"
+        raise InputError(f"law {law.name}", problem, "Accept it with --force, or choose another engine")
     return fit.spec, fit.errors

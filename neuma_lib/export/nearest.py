@@ -63,9 +63,8 @@ def nearest(law: Law, states: Tensor, engine: str, dt: float) -> Fit:
     F = F[:: max(1, len(F) // MAX_STATES)]
     tau = stress(law, F)
     if not bool(tau.isfinite().all()) or not bool(tau.abs().max() > 0):
-        raise InputError(
-            "states", "the law has no finite stress in the visited states", "Give the states of a motion"
-        )
+        problem = "the law has no finite stress in the visited states"
+        raise InputError("states", problem, "Give the states of a motion")
     trial = trial_states(F)
     after = stress(law, returned(law, trial))
     fits = [_fit(engine, names, F, tau, trial, after, dt) for names in RULES[engine]]
@@ -93,9 +92,8 @@ def sampled_states(visited: Mapping[str, Any]) -> Tensor:
     logs = rng.uniform(low, high, (64 * count, 3))
     inside = (np.ptp(logs, axis=1) <= widest) & (logs.sum(axis=1) >= math.log(visited["pressed"]))
     if inside.sum() < count:
-        raise InputError(
-            "visited", "the recorded ranges contain too few states", "Export the law again from its scene"
-        )
+        problem = "the recorded ranges contain too few states"
+        raise InputError("visited", problem, "Export the law again from its scene")
     U, V = (np.linalg.qr(rng.standard_normal((count, 3, 3)))[0] for _ in range(2))
     for Q in (U, V):
         Q[:, :, 0] *= np.linalg.det(Q)[:, None]
@@ -107,9 +105,8 @@ def _fit(engine: str, names, F: Tensor, tau: Tensor, trial: Tensor, after: Tenso
     elastic, plastic = names
     if plastic not in _STARTS:
         return None
-    unit, other = (
-        {"name": elastic, "E": 2 * (1 + nu), "nu": nu} for nu in (0.0, 0.25)
-    )  # mu = 1, lam = 0 and 1
+    # mu = 1, lam = 0 and 1
+    unit, other = ({"name": elastic, "E": 2 * (1 + nu), "nu": nu} for nu in (0.0, 0.25))
     of_mu, both = (stress(analytic_law({"elasticity": each}), F) for each in (unit, other))
     columns = np.stack([of_mu.reshape(-1).numpy(), (both - of_mu).reshape(-1).numpy()], axis=1)
     (mu, lam), _ = nnls(columns, tau.reshape(-1).numpy())

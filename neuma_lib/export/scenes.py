@@ -5,8 +5,6 @@ A folder has ``scene.json`` (material, law, notes and times), ``body.npz`` (star
 ``x`` (T, N, 3) [m] at the times ``t`` (T,) [s], y up: of the particles, or for MuJoCo of the vertices of the mesh.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -62,7 +60,7 @@ class EngineScene:
     @classmethod
     def of(
         cls, mpm: MPM, state: State, steps: int, every: int, gaussians: Gaussians | None = None
-    ) -> EngineScene:
+    ) -> "EngineScene":
         """The scene of a simulation.
 
         Raises:
@@ -89,7 +87,7 @@ class EngineScene:
         return cls(x, v, mass, vol0, *own, colors, tuple(notes))
 
     @classmethod
-    def falling_cube(cls, density: float, dt: float, seconds: float = 0.5) -> EngineScene:
+    def falling_cube(cls, density: float, dt: float, seconds: float = 0.5) -> "EngineScene":
         """A cube above a frictionless floor, the body of files that show a law alone."""
         spacing = SAMPLE_EDGE / SAMPLE_COUNT
         sites = np.indices((SAMPLE_COUNT,) * 3).reshape(3, -1).T - (SAMPLE_COUNT - 1) / 2

@@ -28,10 +28,8 @@ _MARGIN = 0.02  # minimum distance of the body from the walls at the start, as o
 _MOMENTS = 100  # times of a flight at which contact is tested
 _BEFORE = (0.25, 1.5)  # duration of the flight over that after contact: the initial motion must be visible
 _DURATION = 2.5  # of the longest press, in times that the existing video shows after the contact
-_PRESSED, _PLATEN = (
-    (0.1, 0.45),
-    0.02,
-)  # compression over the height of the body, and half the thickness of the platen [m]
+# compression over the height of the body, and half the thickness of the platen [m]
+_PRESSED, _PLATEN = (0.1, 0.45), 0.02
 _CLAMPED = (0.15, 0.35)  # clamped part of the height of the body
 _MIN_CLAMPED = 0.01  # of the particles
 _STEPS = 32  # the steps of a video are a multiple of this, so that its frames are evenly spaced
@@ -160,11 +158,10 @@ def _launch(
     towards[1] = -abs(towards[1])
     velocity = [_rounded(lab.max_speed * draw[0] * n) for n in towards]
     spin = [_rounded(lab.max_spin * draw[1] * n) for n in _direction(draw[4], draw[5])]
-    turned = (
-        Rotation.from_rotvec(math.pi * draw[8] * _direction(draw[6], draw[7]))
-        if turn
-        else Rotation.identity()
-    )
+    if turn:
+        turned = Rotation.from_rotvec(math.pi * draw[8] * _direction(draw[6], draw[7]))
+    else:
+        turned = Rotation.identity()
     rotation = [_rounded(angle) for angle in turned.as_rotvec()]
     R = Rotation.from_rotvec(rotation).as_matrix()
     size = np.ptp(body.x0.double().cpu().numpy() @ R.T, axis=0)
@@ -185,12 +182,7 @@ def _launch(
 
 
 def _press(
-    model: MPM,
-    body: Reconstruction,
-    motion: InitialMotion,
-    after: float,
-    lab: NextConfig,
-    draw: np.ndarray,
+    model: MPM, body: Reconstruction, motion: InitialMotion, after: float, lab: NextConfig, draw: np.ndarray
 ) -> Start | str:
     """A press of a body that is let go just above the floor, by a platen that moves down and up again."""
     size = _size(body)
@@ -244,12 +236,7 @@ def _landing(
 
 
 def _hang(
-    model: MPM,
-    body: Reconstruction,
-    motion: InitialMotion,
-    after: float,
-    lab: NextConfig,
-    draw: np.ndarray,
+    model: MPM, body: Reconstruction, motion: InitialMotion, after: float, lab: NextConfig, draw: np.ndarray
 ) -> Start | str:
     """A hang from a clamp around the upper part of the body, which moves to and fro and may then let go."""
     size = _size(body)

@@ -239,12 +239,7 @@ def choose_next(
 
 
 def _candidates(
-    first: Experiment,
-    known: Knowledge,
-    lab: NextConfig,
-    reframe: bool,
-    seed: int,
-    log: Callable[[str], None],
+    first: Experiment, known: Knowledge, lab: NextConfig, reframe: bool, seed: int, log: Callable[[str], None]
 ) -> list[tuple[str, dict[str, Any], Experiment | None, Trajectory | None]]:
     """Kind, settings, experiment and motion of each candidate; no experiment where the motion diverges.
 
@@ -294,8 +289,7 @@ def _candidates(
 
 @torch.no_grad()
 def _motions(
-    known: Knowledge,
-    motions: Sequence[tuple[MPM, Reconstruction, InitialMotion, tuple[int, ...]]],
+    known: Knowledge, motions: Sequence[tuple[MPM, Reconstruction, InitialMotion, tuple[int, ...]]]
 ) -> list[Trajectory | None]:
     """Motions with the identified constants, together where they have the same model and frames."""
     paths: list[Trajectory | None] = [None] * len(motions)

@@ -1,7 +1,5 @@
 """Families of candidate laws, and their constants as unbounded unknowns."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -83,14 +81,14 @@ class Family:
                     f"{', '.join(sorted(own))} must not be set, since the elasticity and the scene define it",
                 )
 
-    def contains(self, other: Family) -> bool:
+    def contains(self, other: "Family") -> bool:
         """Whether the other family, with fewer constants, is a limit of this one."""
         more = self.return_map in ("von_mises", "viscous_flow") or self._viscous or self.field
         same = self.spec["elasticity"]["name"] == other.spec["elasticity"]["name"]
         same = same and other.field in (None, self.field)
         return bool(more) and same and set(other.constants) < set(self.constants)
 
-    def varies(self, other: Family) -> bool:
+    def varies(self, other: "Family") -> bool:
         """Whether this is the other, uniform family with a field."""
         uniform = tuple(key for key, (part, _) in self._constants.items() if part != "field")
         return self.field is not None and uniform == other.constants and self.contains(other)

@@ -1,8 +1,6 @@
 """Fit of one family of laws, or one for each of several bodies, to the frames of videos: residuals, Jacobian and
 uncertainty (used by `identify` and `identify_bodies`)."""
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Iterable, Sequence
@@ -96,7 +94,7 @@ class FamilyRun:
         """Mean squared residual at the current level, infinite without a simulation."""
         return self.fit.rms**2 if self.fit else math.inf
 
-    def resembles(self, other: FamilyRun) -> bool:
+    def resembles(self, other: "FamilyRun") -> bool:
         """Whether the squared difference of the images is less than ``penalty`` times the squared residuals."""
         own, others = (run._at_level(run._residual(run._u)) for run in (self, other))
         pairs = zip(own, others, strict=True)
@@ -108,7 +106,7 @@ class FamilyRun:
         level: int = 0,
         deviations: np.ndarray | None = None,
         below: float = math.inf,
-        like: Iterable[FamilyRun] = (),
+        like: "Iterable[FamilyRun]" = (),
         **how: Any,
     ) -> None:
         """Fit at a level from the best of some starts, if its squared residuals are below a limit.

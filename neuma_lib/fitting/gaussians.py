@@ -6,8 +6,6 @@ Gaussians with large screen-space gradients are cloned or split up to a maximum 
 the end those with an opacity of at most 0.02, as in the paper.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -117,9 +115,8 @@ def fit_gaussians(
         loss = fit.step(views, batch, background, iteration / settings.iterations)
         losses.append(loss)
         if not math.isfinite(loss):
-            raise NonFiniteError(
-                "gaussians", f"the loss is {loss} in iteration {iteration}. Lower the learning rates"
-            )
+            problem = f"the loss is {loss} in iteration {iteration}. Lower the learning rates"
+            raise NonFiniteError("gaussians", problem)
         if first <= iteration < last and (iteration + 1) % rounds.every == 0:
             fit.densify(generator)
         if progress is not None:
@@ -154,7 +151,7 @@ class _Views:
     cameras: Cameras | list[Cameras]
 
     @classmethod
-    def of(cls, images: Tensor | Sequence[Tensor], cameras: Cameras | Sequence[Cameras]) -> _Views:
+    def of(cls, images: Tensor | Sequence[Tensor], cameras: Cameras | Sequence[Cameras]) -> "_Views":
         """Checked views. Raises InputError if shapes do not match or a mask has no outline."""
         if isinstance(images, Tensor) and isinstance(cameras, Cameras):
             images = images.to(cameras.viewmats.dtype)
@@ -170,7 +167,7 @@ class _Views:
         check_masks(views.masks())
         return views
 
-    def select(self, views: list[int]) -> _Views:
+    def select(self, views: list[int]) -> "_Views":
         if isinstance(self.cameras, Cameras):
             return _Views(self.images[views], self.cameras[views])
         return _Views([self.images[i] for i in views], [self.cameras[i] for i in views])

@@ -48,7 +48,7 @@ from neuma_lib.fitting.family_run import FamilyRun
 from neuma_lib.fitting.frame_batches import check_contact
 from neuma_lib.fitting.identified import FamilyFit, Identified
 from neuma_lib.fitting.video_residuals import VideoResiduals
-from neuma_lib.mechanics.combinations import Values
+from neuma_lib.mechanics.combinations import Values, constants_of
 from neuma_lib.sim.model import MPM, model_of_each
 from neuma_lib.splatting.observation import Observation, joint_frames, several
 
@@ -93,13 +93,11 @@ def identify(
     """
     given = [(motion, body, observation), *other_videos]
     if (count := min(len(joint_frames(several(video))) for *_, video in given)) < 4:
-        raise InputError(
-            "frames", f"{count} frames of the training view must be at least 4, to fit and to evaluate"
-        )
+        problem = f"{count} frames of the training view must be at least 4, to fit and to evaluate"
+        raise InputError("frames", problem)
     if not settings.families:
-        raise InputError(
-            "identify.families", "it has no candidates", "Add at least one elasticity with E and nu"
-        )
+        problem = "it has no candidates"
+        raise InputError("identify.families", problem, "Add at least one elasticity with E and nu")
     models = model_of_each(model, len(given))
     check_contact(models, ((one.of_body(each), joint_frames(several(video))) for one, each, video in given))
     fits_friction = settings.contact_friction == "fitted"
@@ -115,7 +113,7 @@ def identify(
     for video in videos:
         video.hold_out(families[0], settings.held_out)
         video.weight = (videos[0].fitted_pixels / video.fitted_pixels) ** 0.5
-    published_values = _constants(published) if published else {}
+    published_values = constants_of(published) if published else {}
     running: list[FamilyRun] = []
     rounds = len(settings.pyramid)
     other_grid = bool(refined) and settings.refinement > 1
@@ -420,8 +418,3 @@ def select_family(fits: Sequence[FamilyFit], settings: IdentifyConfig) -> tuple[
         and fit.score - best.score < settings.tie
         and not (fit.family.contains(best.family) and fit.score >= best.score)
     ]
-
-
-def _constants(spec: Mapping[str, Mapping[str, Any]]) -> Values:
-    """All constants of a specification."""
-    return {key: float(value) for part in spec.values() for key, value in part.items() if key != "name"}

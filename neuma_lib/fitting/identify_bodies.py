@@ -8,8 +8,6 @@ coarsest level of the image pyramid, from guesses, and then at the finest level 
 frames decide as in `identify`. The joint fit to all frames follows. There is no finer grid.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -118,9 +116,8 @@ def identify_bodies(
     if len(names) < 2 or len(names) != len(bodies):
         raise InputError("bodies", f"{len(bodies)} bodies with {len(names)} motions must be two or more")
     if settings.contact_friction == "fitted":
-        raise InputError(
-            "identify.contact_friction", "is fitted for one body only", "Set it to given for several bodies"
-        )
+        problem = "is fitted for one body only"
+        raise InputError("identify.contact_friction", problem, "Set it to given for several bodies")
     if not settings.families:
         raise InputError("identify.families", "it has no candidates", "Add at least one elasticity")
     families = {name: Family(name, law.plain()) for name, law in settings.families.items()}

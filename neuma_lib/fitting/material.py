@@ -37,13 +37,7 @@ from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.model import MPM, MaterialRegion
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State, Trajectory
-from neuma_lib.splatting.observation import (
-    Observation,
-    joint_frames,
-    rendered_steps,
-    select_frames,
-    several,
-)
+from neuma_lib.splatting.observation import Observation, joint_frames, rendered_steps, select_frames, several
 
 
 class TrajectoryLoss(Protocol):
@@ -109,9 +103,8 @@ class PixelLoss:
 
     def __call__(self, path: Trajectory) -> Tensor:
         if len(path.x) != len(self.steps):
-            raise InputError(
-                "pixel loss", f"{len(path.x)} states must be those of {len(self.steps)} rendered steps"
-            )
+            problem = f"{len(path.x)} states must be those of {len(self.steps)} rendered steps"
+            raise InputError("pixel loss", problem)
         if len(self.videos) == 1:
             return self._of(0, path)
         total, count = path.x.new_zeros(2, len(self.frames))
@@ -320,9 +313,8 @@ class _Loop(TrainingLoop):
             "plastic": [p for p in law.plasticity.parameters() if p.requires_grad],
         }
         if not any(self.nets.values()):
-            raise InputError(
-                f"law {law.name!r}", "it has no trainable parameters", "Attach an adaptor before training"
-            )
+            problem = "it has no trainable parameters"
+            raise InputError(f"law {law.name!r}", problem, "Attach an adaptor before training")
         rates = {
             "elastic": settings.lr_scale * settings.lr_elastic,
             "plastic": settings.lr_scale * settings.lr_plastic,
@@ -342,9 +334,8 @@ class _Loop(TrainingLoop):
             if not math.isfinite(value):
                 raise NonFiniteError("material", f"the loss is not finite at iteration {self.iteration}")
             if value > self.settings.diverged_ratio * max(self.best["loss"], 1e-12):
-                raise NonFiniteError(
-                    "material", f"loss {value:.3e} against a best of {self.best['loss']:.3e}"
-                )
+                problem = f"loss {value:.3e} against a best of {self.best['loss']:.3e}"
+                raise NonFiniteError("material", problem)
             # Copied before the backward pass, which changes accumulated gradients, but kept only if that succeeds.
             best = self._better_state(value)
             norms, weighted = self._backward(frame_losses)

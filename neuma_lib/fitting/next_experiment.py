@@ -22,8 +22,6 @@ All of this is to first order about the identified constants, and assumes that a
 existing ones.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -108,7 +106,7 @@ class Knowledge:
         filmed: Sequence[Experiment],
         settings: IdentifyConfig,
         rivals: Sequence[tuple[Family, Values]] = (),
-    ) -> Knowledge:
+    ) -> "Knowledge":
         """Simulate the existing videos once more, which calibrates the noise, and fit the rivals to them.
 
         Args:
@@ -121,9 +119,8 @@ class Knowledge:
             NonFiniteError: a simulation with the identified constants diverges.
         """
         if fit.covariance is None or not np.isfinite(fit.covariance).all():
-            raise InputError(
-                "identified", "states no uncertainty of the constants", "Identify the scene again"
-            )
+            problem = "states no uncertainty of the constants"
+            raise InputError("identified", problem, "Identify the scene again")
         videos = [each.residuals(settings) for each in filmed]
         for video in videos:
             video.weight = (videos[0].fitted_pixels / video.fitted_pixels) ** 0.5

@@ -234,9 +234,8 @@ class Network:
             if iteration % _REPORT_EVERY == 0 or iteration >= settings.iterations - last:
                 value = float(loss.detach())
                 if not math.isfinite(value):
-                    raise NonFiniteError(
-                        "prior", f"the regression diverged at iteration {iteration}. Lower learning_rate"
-                    )
+                    problem = f"the regression diverged at iteration {iteration}. Lower learning_rate"
+                    raise NonFiniteError("prior", problem)
                 progress(iteration + 1, value)
                 tail += value * (iteration >= settings.iterations - last)
         return tail / last

@@ -24,10 +24,7 @@ _EVALUATION_SEEDS = 10_000
 
 
 def train_prior(
-    spec: Mapping[str, Any],
-    settings: RegressionConfig,
-    seed: int = 0,
-    progress: Progress | None = None,
+    spec: Mapping[str, Any], settings: RegressionConfig, seed: int = 0, progress: Progress | None = None
 ) -> tuple[NeuralLaw, dict[str, Any]]:
     """Train a neural law on an analytic one.
 
@@ -75,17 +72,12 @@ def evaluate_prior(
             with torch.no_grad():
                 path, truth = launch.run(law, steps), launch.run(reference, steps)
         except NonFiniteError as error:
-            raise NonFiniteError(
-                "prior", f"the trained law is unstable ({error.detail}). Increase iterations"
-            ) from error
+            problem = f"the trained law is unstable ({error.detail}). Increase iterations"
+            raise NonFiniteError("prior", problem) from error
         errors.append((path.x - truth.x).square().sum(-1).mean(-1).sqrt())
         chamfers.append(float(chamfer_sequence(path.x, truth.x).mean()))
     rmse = torch.stack(errors)
-    return {
-        "chamfer": sum(chamfers) / launches,
-        "rmse": float(rmse.mean()),
-        "rmse_worst": float(rmse.max()),
-    }
+    return {"chamfer": sum(chamfers) / launches, "rmse": float(rmse.mean()), "rmse_worst": float(rmse.max())}
 
 
 def remark(report: Mapping[str, Any]) -> str:

@@ -43,10 +43,8 @@ _SCALES = np.array(
 )  # rad, m, (prior), 1, 1, s, 1, px
 _SHAPE = slice(9, 13)
 _OF_LOGARITHM = np.array([True, False, False, True])  # numbers of the shape
-_CONTOUR_NOISE, _CORRELATED = (
-    2.0,
-    30.0,
-)  # standard deviation [px] and length [px] over which residuals persist
+# standard deviation [px] and length [px] over which residuals persist
+_CONTOUR_NOISE, _CORRELATED = 2.0, 30.0
 _MARKER_NOISE = 0.5  # px
 _ROBUST = 4.0  # residual beyond which the cost grows linearly [px]
 _SPACING = 3.0  # of points of the observed silhouette [px]

@@ -133,9 +133,8 @@ def train_structured(
     """
     videos = [(start, loss), *other_videos]
     if (count := min(len(loss.frames) for _, loss in videos)) < MIN_FRAMES:
-        raise InputError(
-            "frames", f"{count} must be at least {MIN_FRAMES}, to fit and to evaluate a structured law"
-        )
+        problem = f"{count} must be at least {MIN_FRAMES}, to fit and to evaluate a structured law"
+        raise InputError("frames", problem)
     laws = [law, *rivals]
     uncorrected = [copy.deepcopy(each.state_dict()) for each in laws]
     simulated = [_simulate(model, surrounded(law), *video) for video in videos]

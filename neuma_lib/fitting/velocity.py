@@ -18,8 +18,6 @@ spreading fluid conserves its volume.
 A spin that does not differ significantly from 0 is set to 0, with its standard deviation as an upper limit.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -44,13 +42,7 @@ from neuma_lib.sim.model import MPM, contact_clearance
 from neuma_lib.sim.rigid_flight import rigid_flight
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State, cross_matrix
-from neuma_lib.splatting.observation import (
-    Observation,
-    joint_frames,
-    rendered_steps,
-    select_frames,
-    several,
-)
+from neuma_lib.splatting.observation import Observation, joint_frames, rendered_steps, select_frames, several
 
 NUISANCE_SCALE = 0.02
 """Unit of the constant shift [m] and of the relative enlargement, equivalent to about 1 m/s over a few frames."""
@@ -103,7 +95,7 @@ class VelocityEstimate:
     ridge: float
 
     @classmethod
-    def at_rest(cls, centre: np.ndarray, axes: np.ndarray) -> VelocityEstimate:
+    def at_rest(cls, centre: np.ndarray, axes: np.ndarray) -> "VelocityEstimate":
         """The motion of a body that is held at the start, which is exact."""
         zero = np.zeros(3)
         exact = dict.fromkeys(
@@ -189,9 +181,8 @@ def estimate_velocity(
     if model.clamps:
         return VelocityEstimate.at_rest((body.mass @ body.x0 / body.mass.sum()).cpu().numpy(), axes)
     if float(contact_clearance(model, body.x0, body.vol0)) <= 0:
-        raise InputError(
-            "frames", "the body touches a wall in the first frame", "Start the video before the contact"
-        )
+        problem = "the body touches a wall in the first frame"
+        raise InputError("frames", problem, "Start the video before the contact")
     ends = tuple(max(n + video.exposure[-1] for video in videos if n in video.frames) for n in frames)
     flight = _Flight(model, law, body, ends, others)
     minimise = partial(_minimise, axes=axes, settings=settings, progress=progress)
@@ -441,9 +432,8 @@ class _Residuals:
     def _checked(self, cost: Tensor, unknowns: np.ndarray) -> float:
         value = float(cost)
         if not np.isfinite(value):
-            raise NonFiniteError(
-                "velocity", f"rendered images are not finite at v0 = {unknowns[:3].tolist()}"
-            )
+            problem = f"rendered images are not finite at v0 = {unknowns[:3].tolist()}"
+            raise NonFiniteError("velocity", problem)
         return value
 
 

@@ -357,11 +357,7 @@ def _fish() -> Shape:
         return np.where(np.maximum(body(p), -0.2) < 0.008, on_body, 1.0)
 
     return Shape(
-        parts={
-            "body": union(0.04, body, stalk),
-            "fins": union(0.01, *fins),
-            "side_fins": side_fin,
-        },
+        parts={"body": union(0.04, body, stalk), "fins": union(0.01, *fins), "side_fins": side_fin},
         blend=0.02,
         lower=(-0.25, -0.17, -0.14),
         upper=(0.21, 0.17, 0.14),

@@ -11,9 +11,8 @@ from scipy.spatial import cKDTree
 
 from neuma_lib.errors import InputError
 
-_NEIGHBOURS = (
-    32  # of a vertex. The farthest has no weight, so that coefficients are continuous along the surface
-)
+# of a vertex. The farthest has no weight, so that coefficients are continuous along the surface.
+_NEIGHBOURS = 32
 
 
 def skinning_matrix(vertices: np.ndarray, particles: np.ndarray) -> csr_matrix:

@@ -4,8 +4,6 @@ The surface is more accurate than a pixel or voxel (see `neuma_lib.geometry.visu
 shows stay filled unless depth maps are given. Gaussians fitted to the same views bound the search.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -43,7 +41,7 @@ class _Grid:
     counts: NDArray[np.int64]
 
     @classmethod
-    def around(cls, lower: Array, upper: Array, resolution: int) -> _Grid:
+    def around(cls, lower: Array, upper: Array, resolution: int) -> "_Grid":
         spacing = float((upper - lower).max()) / resolution
         return cls(lower, spacing, np.ceil((upper - lower) / spacing).astype(np.int64) + 1)
 
@@ -133,11 +131,8 @@ def photographed(mesh: trimesh.Trimesh, edge: float, floor: float | None) -> tri
     lower, upper = body.bounds
     if (lower < 0).any() or (upper > BOX_SIDE).any():
         extent = ", ".join(f"{axis} {a:.2f} to {b:.2f}" for axis, a, b in zip("xyz", lower, upper))
-        raise InputError(
-            "surface",
-            f"the body ({extent} m) exceeds the simulator's box, 0 to {BOX_SIDE:g} m along each axis",
-            "Correct `center`, or reduce `scale`, in capture.yaml",
-        )
+        problem = f"the body ({extent} m) exceeds the simulator's box, 0 to {BOX_SIDE:g} m along each axis"
+        raise InputError("surface", problem, "Correct `center`, or reduce `scale`, in capture.yaml")
     return body
 
 

@@ -212,9 +212,8 @@ def visual_hull(
     # if masks may be wrong, a close-up of a part of the object must not limit the search
     reach = _FIELD_OF_VIEW * (widths.median() if spare else widths.min())
     if not float(reach) > 0:
-        raise InputError(
-            "cameras", "are all in one place", "Give images from several places around the object"
-        )
+        problem = "are all in one place"
+        raise InputError("cameras", problem, "Give images from several places around the object")
     lower, upper = centre - reach, centre + reach
     for size in (resolution // 2, resolution, resolution):
         voxel = float((upper - lower).max()) / size

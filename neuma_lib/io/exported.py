@@ -85,11 +85,8 @@ def checked_export(metadata: Mapping[str, Any]) -> dict[str, Any]:
     about = metadata[EXPORT]
     schema = about.get("schema") if isinstance(about, dict) else None
     if type(schema) is not int or not 1 <= schema <= SCHEMA:
-        raise InputError(
-            f"{EXPORT}.schema",
-            f"this code reads up to version {SCHEMA}, not {one_line(schema)}",
-            "Update the code, or export the law again",
-        )
+        problem = f"this code reads up to version {SCHEMA}, not {one_line(schema)}"
+        raise InputError(f"{EXPORT}.schema", problem, "Update the code, or export the law again")
     check_step(f"{EXPORT}.dt", about.get("dt"))
     return about
 

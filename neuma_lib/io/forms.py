@@ -1,7 +1,5 @@
 """Expected entries of the JSON files of stages, and objects that name their file if an entry is missing."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +17,7 @@ class JsonObject(dict):
         raise InputError(self.where, f"has no entry '{key}'", _REMEDY)
 
     @classmethod
-    def of(cls, pairs: list[tuple[str, Any]], where: str) -> JsonObject:
+    def of(cls, pairs: list[tuple[str, Any]], where: str) -> "JsonObject":
         """From the entries of an object, of which no two may have one key."""
         made = cls(pairs)
         if len(made) < len(pairs):
@@ -41,11 +39,7 @@ _MOTION = {
     "particles": int,
 }
 _QUANTITIES = {"*": {"value": (float, None), "log_std": (float, None)}}
-_FIT = {
-    "law": {"*": {"*": (float, str)}},
-    "constants": _QUANTITIES,
-    "quantities": _QUANTITIES,
-}
+_FIT = {"law": {"*": {"*": (float, str)}}, "constants": _QUANTITIES, "quantities": _QUANTITIES}
 FORMS: dict[str, Any] = {
     "velocity.json": {**_MOTION, "bodies": [_MOTION]},
     "identified.json": {

@@ -1,7 +1,5 @@
 """A moving surface as binary glTF 2.0: a mesh with one morph target per frame, and an animation of their weights."""
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Callable, Iterator, Sequence

@@ -228,9 +228,8 @@ def _labels(frames: Sequence[Mapping[str, Any]], path: str | Path) -> np.ndarray
     labels, folder = [], Path(path).parent
     for k, frame in enumerate(frames):
         if not isinstance(frame.get("label_path"), str):
-            raise InputError(
-                f"{path}: frame {k}", "has no label_path", "Give an image of the bodies' numbers"
-            )
+            problem = "has no label_path"
+            raise InputError(f"{path}: frame {k}", problem, "Give an image of the bodies' numbers")
         file = image_file(folder, frame["label_path"], path)
         with open_image(read_regular(file), file) as image:
             labels.append(np.array(image.convert("L")))

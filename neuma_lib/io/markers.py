@@ -27,9 +27,8 @@ def read_markers(path: str | Path, names: Sequence[str]) -> MarkerTracks:
     try:
         table = np.array([[float(value) for value in row] for row in rows if row])
     except ValueError as error:
-        raise InputError(
-            path, f"a value is no number: {error}", "Fill or cut the gaps of the record"
-        ) from None
+        problem = f"a value is no number: {error}"
+        raise InputError(path, problem, "Fill or cut the gaps of the record") from None
     unit = next((unit for unit in UNITS if f"{names[0]}_x_{unit}" in header), "m")
     columns = [f"{name}_{axis}_{unit}" for name in names for axis in "xyz"]
     if missing := [name for name in (TIME, *columns) if name not in header]:

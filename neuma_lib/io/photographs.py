@@ -1,7 +1,5 @@
 """Mattes of photographs of any size, each cropped to its mask and downsampled if larger than needed."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -49,7 +47,7 @@ class StaticViews:
     left_out: tuple[str, ...] = ()
     hidden: Sequence[torch.Tensor] | None = None
 
-    def to(self, device: torch.device) -> StaticViews:
+    def to(self, device: torch.device) -> "StaticViews":
         """The same views on another device."""
         images, cameras = self.images, self.cameras
         if isinstance(images, torch.Tensor):

@@ -50,21 +50,18 @@ def read_positions(files: Sequence[str | Path]) -> tuple[np.ndarray, np.ndarray 
             raise InputError(first, f"has no array {' or '.join(NAMES)}", _REMEDY)
         x, frames = arrays[names[0]], arrays.get("frames")
     else:
-        raise InputError(
-            first, "positions must be one .h5 or .npz file, or .ply files alone", "Give FILE again"
-        )
+        problem = "positions must be one .h5 or .npz file, or .ply files alone"
+        raise InputError(first, problem, "Give FILE again")
     if x.ndim != 3 or x.shape[2] != 3 or 0 in x.shape or x.dtype.kind not in "fiu":
-        raise InputError(
-            first, f"positions of shape {x.shape} as {x.dtype} must be (T, N, 3) numbers", _REMEDY
-        )
+        problem = f"positions of shape {x.shape} as {x.dtype} must be (T, N, 3) numbers"
+        raise InputError(first, problem, _REMEDY)
     if frames is not None and (frames.shape != x.shape[:1] or frames.dtype.kind not in "iu"):
         problem = f"frames of shape {frames.shape} as {frames.dtype} must be {len(x)} integers"
         raise InputError(first, problem, "Write the simulation step of each frame, or leave them out")
     if not np.isfinite(x).all():
         frame, point = np.argwhere(~np.isfinite(x))[0][:2]
-        raise InputError(
-            first, f"point {point} of frame {frame} is not finite", "Repeat the last finite frame instead"
-        )
+        problem = f"point {point} of frame {frame} is not finite"
+        raise InputError(first, problem, "Repeat the last finite frame instead")
     if (size := float(np.abs(x).max())) > MAX_DISTANCE:
         raise InputError(first, f"a coordinate is {size:.3g} m, outside the unit cube by far", _REMEDY)
     return x.astype(np.float64), frames
@@ -85,9 +82,8 @@ def _read_plys(paths: Sequence[Path]) -> np.ndarray:
     """Vertices (T, N, 3) of a PLY per frame, in the order of their numbers."""
     numbers = [int((re.findall(r"\d+", path.stem) or ["-1"])[-1]) for path in paths]
     if len(paths) > 1 and (min(numbers) < 0 or len(set(numbers)) < len(numbers)):
-        raise InputError(
-            paths[0], "the names must end in different numbers of frames", "Use frame_000.ply, ..."
-        )
+        problem = "the names must end in different numbers of frames"
+        raise InputError(paths[0], problem, "Use frame_000.ply, ...")
     frames: list[np.ndarray] = []
     for _, path in sorted(zip(numbers, paths, strict=True)):
         rows, _ = read_ply(path)

@@ -1,7 +1,5 @@
 """A moving surface as USD (Universal Scene Description): a mesh with time samples of its points."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,8 +10,7 @@ from neuma_lib.geometry.obstacles import Obstacle
 from neuma_lib.io.files import atomic
 from neuma_lib.io.gltf import linear, mesh_names, parts_of
 
-CODES_A_SECOND = 24.0
-"""USD time codes per second; frames may have fractional codes."""
+CODES_A_SECOND = 24.0  # USD time codes per second; frames may have fractional codes
 
 
 def write_usd(

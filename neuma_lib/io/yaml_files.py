@@ -13,9 +13,8 @@ MAX_BYTES = 300_000
 MAX_EXPANDED = 1_000_000  # values and characters, with every alias replaced by what it names
 MAX_DEPTH = 50  # deeper nesting overflows the stack of the parser in C
 TOO_DEEP = f"values are nested more than {MAX_DEPTH} deep"
-MAX_TEXT = (
-    3_000  # characters of one value; longer integers take quadratic time, and Python does not print them
-)
+# characters of one value; longer integers take quadratic time, and Python does not print them
+MAX_TEXT = 3_000
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the same values, several times as fast
 _START = (yaml.MappingStartEvent, yaml.SequenceStartEvent)
 _END = (yaml.MappingEndEvent, yaml.SequenceEndEvent)
@@ -42,9 +41,8 @@ def parse_yaml(content: str | bytes, where: str | Path) -> Any:
             of too many aliases.
     """
     if len(content) > MAX_BYTES:
-        raise InputError(
-            where, f"it is larger than {MAX_BYTES} bytes", "Split it or remove what is not needed"
-        )
+        problem = f"it is larger than {MAX_BYTES} bytes"
+        raise InputError(where, problem, "Split it or remove what is not needed")
     with reading(where, "YAML"):
         try:
             _check(content, where)

@@ -42,9 +42,8 @@ class Adaptor(nn.Module):
     def __init__(self, base: Sequence[Tensor], rank: int | None = 16, alpha: float = 16.0, seed: int = 0):
         super().__init__()
         if rank is not None and (not isinstance(rank, int) or rank < 1):
-            raise InputError(
-                "adaptor.rank", f"{rank!r} must be a positive integer, or null for full matrices"
-            )
+            problem = f"{rank!r} must be a positive integer, or null for full matrices"
+            raise InputError("adaptor.rank", problem)
         self.rank, self.alpha = rank, float(alpha)
         self.weight = 1.0
         """Multiplier w of the correction: 1 is the trained law, 0 the prior."""

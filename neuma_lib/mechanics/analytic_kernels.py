@@ -14,15 +14,7 @@ from torch import Tensor
 
 from neuma_lib.device import native_source, start_warp
 from neuma_lib.mechanics.fused_launch import addressed, launch_blocks
-from neuma_lib.mechanics.singular_values_kernels import (
-    END,
-    FUSE,
-    MATH,
-    SVD,
-    TYPES,
-    filled,
-    pack_count,
-)
+from neuma_lib.mechanics.singular_values_kernels import END, FUSE, MATH, SVD, TYPES, filled, pack_count
 
 start_warp()
 

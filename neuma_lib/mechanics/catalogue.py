@@ -148,9 +148,8 @@ def register(part: str, name: str, constants: Mapping[str, Constant], module: st
     if name in laws and (other := DEFINED_IN.get((part, name))) != module:
         owner = f"{other} defines" if other else "the built-in laws have"
         remedy = "Choose another name. If it is the same file, load it only once: import it, or list it in extensions"
-        raise InputError(
-            module, f"{owner} another {part} {name!r}", remedy if other else "Choose another name"
-        )
+        problem = f"{owner} another {part} {name!r}"
+        raise InputError(module, problem, remedy if other else "Choose another name")
     laws[name], DEFINED_IN[part, name] = dict(constants), module
 
 
@@ -167,9 +166,8 @@ def complete(spec: Mapping[str, Any], dt: float | None = None) -> dict[str, dict
     """
     if "elasticity" not in spec or not set(spec) <= set(PARTS):
         keys = ", ".join(map(str, spec)) or "none"
-        raise InputError(
-            "law", f"its keys must be elasticity and optionally plasticity, viscosity and field, not {keys}"
-        )
+        problem = f"its keys must be elasticity and optionally plasticity, viscosity and field, not {keys}"
+        raise InputError("law", problem)
     elastic = dict(spec["elasticity"])
     plastic = dict(spec.get("plasticity") or {"name": "identity"})
     _known_name("elasticity", elastic, ELASTICITY)

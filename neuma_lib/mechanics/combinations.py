@@ -1,6 +1,16 @@
 """Combinations of material constants that can be identifiable from motion when single constants are not."""
 
+from collections.abc import Mapping
+from typing import Any
+
 Values = dict[str, float]  # constants by name, in SI units and degrees
+
+
+def constants_of(spec: Mapping[str, Mapping[str, Any] | None]) -> Values:
+    """Constants of all parts of the specification of a law."""
+    return {
+        key: float(value) for part in spec.values() for key, value in (part or {}).items() if key != "name"
+    }
 
 
 def physical(values: Values) -> Values:

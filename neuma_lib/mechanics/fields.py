@@ -5,8 +5,6 @@ of the return map are the same everywhere. The place s at the start is measured 
 particle of the body to 1 at the last.
 """
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import torch
@@ -25,7 +23,7 @@ class Field(Constants, nn.Module):
     x towards z, by default along x."""
 
     part = "field"
-    named: ClassVar[dict[str, type[Field]]] = {}
+    named: "ClassVar[dict[str, type[Field]]]" = {}
 
     def __init_subclass__(cls, name: str, **options):
         super().__init_subclass__(**options)

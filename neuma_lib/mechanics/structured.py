@@ -57,22 +57,10 @@ from neuma_lib.mechanics import structured_kernels as kernels
 from neuma_lib.mechanics.adaptor import AdaptableConstitutive, AdaptableLaw, layers_of
 from neuma_lib.mechanics.analytic import analytic_law, name_of, specification
 from neuma_lib.mechanics.catalogue import lame
-from neuma_lib.mechanics.elasticity import (
-    STRETCH_MIN,
-    AnalyticElasticity,
-    FixedCorotated,
-    Hencky,
-    NeoHookean,
-)
+from neuma_lib.mechanics.elasticity import STRETCH_MIN, AnalyticElasticity, FixedCorotated, Hencky, NeoHookean
 from neuma_lib.mechanics.isotropic import PAIRS, Quotients, coaxial_deformation, coaxial_stress
 from neuma_lib.mechanics.law import Elasticity, Plasticity, Weights
-from neuma_lib.mechanics.plasticity import (
-    DruckerPrager,
-    Identity,
-    ViscousFlow,
-    VonMises,
-    hencky_strain,
-)
+from neuma_lib.mechanics.plasticity import DruckerPrager, Identity, ViscousFlow, VonMises, hencky_strain
 from neuma_lib.mechanics.singular_values import rotation_and_singular_values
 from neuma_lib.mechanics.structured_kernels import (
     COHESION_UNIT,

@@ -9,8 +9,6 @@ itself a law (`Viscosity.branch`) of parts with kernels: `ShearSpring` and `plas
 its particles at the places of the others (`neuma_lib.sim.branches`).
 """
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 from torch import nn
@@ -45,7 +43,7 @@ class Viscosity(Constants, nn.Module):
     """
 
     part = "viscosity"
-    named: ClassVar[dict[str, type[Viscosity]]] = {}
+    named: "ClassVar[dict[str, type[Viscosity]]]" = {}
     _kept: Law | None = None
 
     def __init_subclass__(cls, name: str, **options):

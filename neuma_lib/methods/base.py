@@ -374,11 +374,10 @@ def friction_options(case: Case) -> dict[str, Any]:
 
 def training_inputs(case: Case) -> Files:
     """Body, supervision and initial motion of each video of a scene."""
-    supervision = (
-        {"transforms": case.each_video(lambda each: each.data("dynamic/transforms.json"))}
-        if case.options.supervision == "pixels"
-        else {"truth": case.each_video(lambda each: each.data("truth.h5"))}
-    )
+    if case.options.supervision == "pixels":
+        supervision = {"transforms": case.each_video(lambda each: each.data("dynamic/transforms.json"))}
+    else:
+        supervision = {"truth": case.each_video(lambda each: each.data("truth.h5"))}
     start = case.identified() if case.options.start == "identified" else "velocity.json"
     return {
         **body_of_each_video(case),

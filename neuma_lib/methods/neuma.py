@@ -60,11 +60,7 @@ class Neuma(Method):
         training = Training(inputs, options, settings, problem, run)
         trained = train_material(*training.problem(law), **training.options())
         training.write_history(trained)
-        about = {
-            "settings": options,
-            "grid": problem.simulation["grid"],
-            **training.report(trained),
-        }
+        about = {"settings": options, "grid": problem.simulation["grid"], **training.report(trained)}
         save_adaptor(run.product, trained.law, settings.rank, settings.alpha, about)
         training.finish(trained)
 

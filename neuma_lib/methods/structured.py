@@ -132,11 +132,7 @@ class Structured(Method):
         )
         run.log(chosen.summary())
         training.write_history(trained, chosen.as_dict())
-        about = {
-            "settings": options,
-            "grid": problem.simulation["grid"],
-            **training.report(trained),
-        }
+        about = {"settings": options, "grid": problem.simulation["grid"], **training.report(trained)}
         about |= {FRICTION: identified[FRICTION]} if friction is not None else {}
         save_adaptor(run.product, trained.law, settings.rank, settings.alpha, about)
         training.finish(trained)

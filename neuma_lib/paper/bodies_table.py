@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from neuma_lib.evaluation.text_tables import as_csv, as_markdown
-from neuma_lib.mechanics.combinations import named_combinations
+from neuma_lib.mechanics.combinations import constants_of, named_combinations
 
 COLUMNS = ("body", "quantity", "truth", "together", "log_std", "alone", "alone_log_std")
 _NOTE = (
@@ -46,10 +46,7 @@ def bodies_table(
             if spec.get(part) and spec[part]["name"] != "identity"
         )
         rows.append([name, "family", true_family, records[0]["family"], None, records[1]["family"], None])
-        constants = {
-            key: value for part in spec.values() if part for key, value in part.items() if key != "name"
-        }
-        for key, value in named_combinations(constants).items():
+        for key, value in named_combinations(constants_of(spec)).items():
             fitted = [record["best"]["quantities"].get(key, {}) for record in records]
             numbers = [number for each in fitted for number in (each.get("value"), each.get("log_std"))]
             rows.append([name, key, value, *numbers])

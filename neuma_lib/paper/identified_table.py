@@ -7,7 +7,7 @@ from typing import Any
 
 from neuma_lib.errors import InputError
 from neuma_lib.evaluation.text_tables import as_csv, as_markdown
-from neuma_lib.mechanics.combinations import named_combinations
+from neuma_lib.mechanics.combinations import constants_of, named_combinations
 from neuma_lib.paper.claims import Verdict, counted, verdict_lines
 
 WITHIN = 2.0  # maximum error in estimated standard deviations
@@ -33,7 +33,7 @@ RULE = (
 
 def true_values(truth: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
     """Constants of a law and their combinations, from its specification."""
-    values = {key: float(value) for part in truth.values() for key, value in part.items() if key != "name"}
+    values = constants_of(truth)
     return named_combinations(values) if {"E", "nu"} <= values.keys() else values
 
 
@@ -86,9 +86,8 @@ def identified_table(scenes: Sequence[Mapping[str, Any]]) -> tuple[str, str]:
         InputError: there are no scenes.
     """
     if not scenes:
-        raise InputError(
-            "tables.table1", "no scene has been identified", "Name scenes there, or set random.count"
-        )
+        problem = "no scene has been identified"
+        raise InputError("tables.table1", problem, "Name scenes there, or set random.count")
     rows, groups = [], {}
     for scene in scenes:
         identified, laws = scene["identified"], (scene["identified"], scene["truth"])

@@ -54,9 +54,8 @@ def load_image_grid(path: str | Path) -> ImageGrid:
     arrays, attributes = read_arrays(path, required=("images",))
     missing = [name for name in ("rows", "columns", "numbers") if name not in attributes]
     if missing:
-        raise InputError(
-            path, f"not the data of a figure, it has no {', '.join(missing)}", "Build the figure again"
-        )
+        problem = f"not the data of a figure, it has no {', '.join(missing)}"
+        raise InputError(path, problem, "Build the figure again")
     rows, columns, numbers = (parse_json(attributes[name], path) for name in ("rows", "columns", "numbers"))
     return ImageGrid(arrays["images"], tuple(rows), tuple(columns), numbers)
 

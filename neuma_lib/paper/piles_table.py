@@ -46,9 +46,8 @@ def piles_table(scenes: Sequence[Mapping[str, Any]], seed: int, is_development: 
         InputError: there are no scenes.
     """
     if not scenes:
-        raise InputError(
-            "random.bodies", "there are no random scenes of several bodies", "Set random.count too"
-        )
+        problem = "there are no random scenes of several bodies"
+        raise InputError("random.bodies", problem, "Set random.count too")
     rows, ratios, families, constants, frictions, rest, cost = [], [], [], [], [], [], []
     for scene in scenes:
         (identified,), (true_law, together) = scene["identified"], scene["metrics"]

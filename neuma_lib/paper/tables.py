@@ -220,9 +220,8 @@ def chamfer_table(
         InputError: there are no methods or columns, a method lacks a column, or a value is not finite.
     """
     if not titles or not columns:
-        raise InputError(
-            "tables", "no methods, or neither scenes nor experiments", "Name some in the table's settings"
-        )
+        problem = "no methods, or neither scenes nor experiments"
+        raise InputError("tables", problem, "Name some in the table's settings")
     table = Table(dict(columns), paper=paper, notes=notes or {}, note=note)
 
     def values(quantity: str, method: str) -> list[list[float]]:
@@ -231,9 +230,8 @@ def chamfer_table(
 
     for method, column in product(titles, columns):
         if not metrics.get(method, {}).get(column):
-            raise InputError(
-                "tables", f"no metrics.json of {method} on {column}", "Compute it, or remove the method"
-            )
+            problem = f"no metrics.json of {method} on {column}"
+            raise InputError("tables", problem, "Compute it, or remove the method")
     for quantity, method in product((*QUANTITIES, BROKEN), titles):
         table.add(quantity, method, titles[method], values(quantity, method))
     table.add(FLOOR, "floor", "Sampling floor", values(FLOOR, next(iter(titles)))[:1])

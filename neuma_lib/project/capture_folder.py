@@ -49,11 +49,8 @@ class Capture:
     def pictures(self) -> dict[str, tuple[Path, ...]]:
         """Photographs and stills, by group. Raises InputError if photographs, or the still of a camera, are missing."""
         if not self.photographs:
-            raise InputError(
-                self.folder / self.settings.photographs,
-                f"no photographs ({', '.join(PICTURES)})",
-                "Put them there",
-            )
+            problem = f"no photographs ({', '.join(PICTURES)})"
+            raise InputError(self.folder / self.settings.photographs, problem, "Put them there")
         filmed = {camera for videos in self.takes.values() for camera in videos}
         for camera in sorted(filmed - self.stills.keys()):
             raise InputError(
@@ -66,9 +63,8 @@ class Capture:
     def video(self, take: str, camera: str) -> Path:
         """The video of a take by a camera. Raises InputError if there is none."""
         if camera not in self.cameras_of(take):
-            raise InputError(
-                self.folder, f"no video of '{take}' by '{camera}'{hint(camera, self.takes[take])}"
-            )
+            problem = f"no video of '{take}' by '{camera}'{hint(camera, self.takes[take])}"
+            raise InputError(self.folder, problem)
         return self.takes[take][camera]
 
     def cameras_of(self, take: str) -> tuple[str, ...]:
@@ -120,9 +116,8 @@ def inside(folder: str | Path, name: str | Path) -> Path:
     root = Path(folder).resolve()
     path = (root / name).resolve()
     if path != root and root not in path.parents:
-        raise InputError(
-            Path(folder) / name, f"it is outside the capture's folder {folder}", "Copy the file there"
-        )
+        problem = f"it is outside the capture's folder {folder}"
+        raise InputError(Path(folder) / name, problem, "Copy the file there")
     return Path(folder) / name
 
 
@@ -149,16 +144,12 @@ def read_capture(folder: str | Path) -> Capture:
     cameras = sorted({camera for videos in takes.values() for camera in videos} | stills.keys())
     for camera in settings.cameras:
         if camera not in cameras:
-            raise InputError(
-                f"{source}: cameras.{camera}", f"no video or still has this name{hint(camera, cameras)}"
-            )
+            problem = f"no video or still has this name{hint(camera, cameras)}"
+            raise InputError(f"{source}: cameras.{camera}", problem)
     for name in (*cameras, *takes):
         if not NAME.fullmatch(name):
-            raise InputError(
-                folder,
-                f"'{one_line(name)}' cannot name folders and results",
-                "Rename it, with letters, digits, - and _",
-            )
+            problem = f"'{one_line(name)}' cannot name folders and results"
+            raise InputError(folder, problem, "Rename it, with letters, digits, - and _")
     if PHOTOGRAPHS in cameras:
         raise InputError(folder, f"a video camera cannot be named '{PHOTOGRAPHS}'", "Rename its files")
     names = [file.name for file in photographs]
@@ -206,9 +197,8 @@ def _pictures(folder: Path, name: str) -> tuple[Path, ...]:
                 file, problem, "Run `pip install pillow-heif`, or convert it to JPEG and remove it"
             )
         if suffix in OTHER_PICTURES:
-            raise InputError(
-                file, "this picture format is not supported", "Convert it to JPEG, and remove it"
-            )
+            problem = "this picture format is not supported"
+            raise InputError(file, problem, "Convert it to JPEG, and remove it")
     return tuple(_by_stem(folder, name, (*PICTURES, *decoded)).values())
 
 

@@ -114,7 +114,6 @@ def training_takes(capture: Capture) -> list[str]:
         raise InputError(where, "all takes are held out", "Keep at least one for training")
     for take in trained[1:]:
         if list(capture.takes[take]) != list(capture.takes[trained[0]]):
-            raise InputError(
-                where, f"'{take}' and '{trained[0]}' have different cameras", "Hold one of them out"
-            )
+            problem = f"'{take}' and '{trained[0]}' have different cameras"
+            raise InputError(where, problem, "Hold one of them out")
     return trained

@@ -1,7 +1,5 @@
 """Methods on scenes: options, runs and paths of a preset or variant. No file is read or has to exist."""
 
-from __future__ import annotations
-
 import typing
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -37,7 +35,7 @@ class ProjectCase(Case):
     method: Method
     together: tuple[str, str] | None = None
 
-    def on_moved(self) -> ProjectCase:
+    def on_moved(self) -> "ProjectCase":
         return replace(self, scene=self.moved)
 
     @property
@@ -203,9 +201,8 @@ def law_from(settings: Config, method: str) -> str | None:
     if source is not None and source not in settings.scenes:
         raise InputError(method, f"no scene '{source}'{hint(source, settings.scenes)}")
     if source is not None and not kind_of(settings, method).moves_other_bodies:
-        raise InputError(
-            method, "its model moves only the body that it is fitted to", f"Leave out {LAW_FROM}"
-        )
+        problem = "its model moves only the body that it is fitted to"
+        raise InputError(method, problem, f"Leave out {LAW_FROM}")
     return source
 
 
@@ -283,9 +280,8 @@ def body_cases(settings: Config, column: str, method: str) -> list[ProjectCase]:
         file = paths.result_path(settings, replicate_folder(pile, seeds), "identified.json")
         cases = [replace(each, together=(file, name)) for each, name in zip(cases, names, strict=True)]
     if len(cases) > 1 and not cases[0].method.has_law:
-        raise InputError(
-            f"{column}/{method}", "it has no material law, so that it cannot move several bodies together"
-        )
+        problem = "it has no material law, so that it cannot move several bodies together"
+        raise InputError(f"{column}/{method}", problem)
     return cases
 
 
@@ -326,9 +322,8 @@ def moving_methods(settings: Config, scene: str, requested: Sequence[str]) -> li
     moving = []
     for method in requested:
         if not kind_of(settings, method).moves_other_bodies:
-            raise InputError(
-                f"{scene}/{method}", "a splat has no video to fit this method to", "Leave the method out"
-            )
+            problem = "a splat has no video to fit this method to"
+            raise InputError(f"{scene}/{method}", problem, "Leave the method out")
         elsewhere = case(settings, scene, method).learned_from_moved_scene
         sources = settings.figures.i23d if elsewhere else (None,)
         moving += [f"{method}+{LAW_FROM}={source}" if source else method for source in sources]

@@ -73,10 +73,8 @@ def _name_errors(settings: Config) -> Iterator[InputError]:
             if problem := name_problem(name):
                 yield InputError(f"{kind}.{one_line(name)}", problem, "Choose another name")
     if IDENTIFIED in settings.priors.laws:
-        where, problem = (
-            f"priors.laws.{IDENTIFIED}",
-            "the name is reserved for the law identified in the video",
-        )
+        where = f"priors.laws.{IDENTIFIED}"
+        problem = "the name is reserved for the law identified in the video"
         yield InputError(where, problem, "Choose another name")
     for name in settings.scenes.keys() & settings.experiments.keys():
         yield InputError(f"experiments.{name}", "a scene has this name")

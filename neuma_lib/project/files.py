@@ -1,7 +1,5 @@
 """The files that a viewer reads, and access control for them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -54,7 +52,7 @@ class SceneFiles:
         return asdict(self)
 
     @classmethod
-    def of_plain(cls, plain: Mapping[str, Any]) -> SceneFiles:
+    def of_plain(cls, plain: Mapping[str, Any]) -> "SceneFiles":
         """Inverse of `plain`."""
         runs = (RunFiles(**{**run, "law": run["law"] and ModelSource(**run["law"])}) for run in plain["runs"])
         return cls(**{**plain, "runs": tuple(runs), "roots": tuple(plain["roots"])})

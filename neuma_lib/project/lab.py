@@ -9,7 +9,7 @@ from neuma_lib.evaluation.text_tables import as_markdown
 from neuma_lib.fitting.choose_next import read_fit
 from neuma_lib.fitting.next_experiment import stds, undetermined
 from neuma_lib.io.files import read_json, write_json, write_text
-from neuma_lib.mechanics.combinations import physical
+from neuma_lib.mechanics.combinations import constants_of, physical
 from neuma_lib.project.project import Project
 from neuma_lib.project.scaffold import next_scene
 
@@ -86,9 +86,8 @@ def run_lab(
         })  # fmt: skip
         write_json(history, rounds)
         log(f"{name}: {describe(best)}")
-    law = settings.scene(scene).plain()["law"]
-    truth = {key: value for part in law.values() for key, value in part.items() if key != "name"}
-    write_text(folder / "lab.md", PAGE.format(scene=scene, end=end, table=_table(rounds, physical(truth))))
+    truth = physical(constants_of(settings.scene(scene).plain()["law"]))
+    write_text(folder / "lab.md", PAGE.format(scene=scene, end=end, table=_table(rounds, truth)))
     log(end)
     return True
 

@@ -40,10 +40,7 @@ def load(
     refuse_old_keys({"scenes": named})
     scenes, changes = dict(named), raw.get("scenes") or {}
     random = _random_scenes(raw)
-    for kind, others in {
-        "random settings have": random,
-        "a capture has": captured or {},
-    }.items():
+    for kind, others in {"random settings have": random, "a capture has": captured or {}}.items():
         for name in others.keys() & scenes.keys():
             raise InputError(f"scenes.{name}", f"{kind} a scene of this name", "Rename one of the two")
         scenes |= others

@@ -1,7 +1,5 @@
 """The project that a folder of results belongs to, and its settings."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -65,7 +63,7 @@ class Project(NamedTuple):
         place: str | Path,
         configfiles: Sequence[str | Path] = (),
         log: Callable[[InputError], None] = warn_of_missing_scenes,
-    ) -> Project:
+    ) -> "Project":
         """The project that a folder lies in.
 
         Args:

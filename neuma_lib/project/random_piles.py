@@ -1,7 +1,5 @@
 """Random scenes of several bodies that touch each other, for a benchmark without manual choices (`random_scenes`)."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import combinations
@@ -114,7 +112,7 @@ class _Fall(NamedTuple):
     radius: float  # of a sphere with the volume of the cube of the mean side [m]
 
     @classmethod
-    def of(cls, body: Mapping[str, Any], seconds: float, gravity: Vector) -> _Fall:
+    def of(cls, body: Mapping[str, Any], seconds: float, gravity: Vector) -> "_Fall":
         centres, turned = flight(body, body["size"], gravity, seconds)
         half = np.abs(turned).sum(axis=2)
         below = (centres - half)[:, 1] <= 0

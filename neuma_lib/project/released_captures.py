@@ -53,11 +53,8 @@ def object_folder(folder: str | Path, name: str) -> tuple[Path, bool]:
 def floor_height(name: str, ground: float | None) -> float:
     """z of the floor: the given one, or that of an object in Spring-Gaus' settings."""
     if ground is None and name not in GROUND:
-        raise InputError(
-            name,
-            "the floor of this object is unknown",
-            "Set `ground`, z of the floor in the world of the files",
-        )
+        problem = "the floor of this object is unknown"
+        raise InputError(name, problem, "Set `ground`, z of the floor in the world of the files")
     return GROUND[name] if ground is None else ground
 
 

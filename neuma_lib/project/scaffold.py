@@ -178,9 +178,8 @@ def new_capture(root: Path, name: str, settings: Config) -> Path:
 def _check_name(name: str, settings: Config) -> None:
     """Raises InputError if a name cannot be that of a new scene."""
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
-        raise InputError(
-            name, "a scene's name must consist of letters, digits and _, and begin with a letter"
-        )
+        problem = "a scene's name must consist of letters, digits and _, and begin with a letter"
+        raise InputError(name, problem)
     if problem := name_problem(name):
         raise InputError(name, problem)
     if name in settings.scenes or name in settings.experiments:

@@ -249,14 +249,9 @@ class Config(Section):
         substeps = round(dt / step)
         if substeps < 1 or abs(dt / step - substeps) > 1e-6 * substeps:
             key = f"{origin}.truth.dt" if own.dt else "dataset.dt"
-            raise InputError(
-                key, f"{step:g} s is not an integer fraction of the time step {dt:g} s of {origin}"
-            )
-        return TruthConfig(
-            grid=grid,
-            dt=step,
-            particles=own.particles or self.dataset.particles,
-        )
+            problem = f"{step:g} s is not an integer fraction of the time step {dt:g} s of {origin}"
+            raise InputError(key, problem)
+        return TruthConfig(grid=grid, dt=step, particles=own.particles or self.dataset.particles)
 
     def video_scenes(self, name: str) -> list[str]:
         """Folders of the scenes whose videos train the law of a scene, in its replicate: itself, then the others."""

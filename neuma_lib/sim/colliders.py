@@ -1,7 +1,5 @@
 """Rigid obstacles with a signed distance, friction and a prescribed motion."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 from collections.abc import Sequence
@@ -138,7 +136,7 @@ class Collider(Motion):
             raise InputError("collider.damping", f"{self.damping!r} must be a number from 0 to 1")
 
     @staticmethod
-    def plane(point: Sequence[float], normal: Sequence[float], **options) -> Collider:
+    def plane(point: Sequence[float], normal: Sequence[float], **options) -> "Collider":
         """The half-space below a plane through a point [m]; ``normal`` points out of it. Options as for `Collider`."""
         n = torch.tensor(normal, dtype=torch.float64)
         if n.shape != (3,) or not 0 < float(n.norm()) < math.inf:

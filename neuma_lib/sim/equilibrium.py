@@ -35,9 +35,6 @@ and not of the elements: the tip of the silicone beam (docs/results/silicone.md)
 elements of 30, 15 and 7.5 mm."""
 _ITERATIONS = 20  # of Newton's method, before a smaller load is tried
 _ROUGH_TOLERANCE = 1e-3  # of increments before the last
-_MAX_GROWTH = (
-    1e4  # of the residual within an increment, since it rises by orders of magnitude where a body turns
-)
 _FIRST_INCREMENT, _MIN_INCREMENT = 0.25, 1e-3  # of the load
 _LOGGER = logging.getLogger(__name__)
 
@@ -140,9 +137,8 @@ def clamped_nodes(body: Hexahedra, clamps: Sequence[Clamp]) -> NDArray[np.bool_]
         held = ((body.nodes >= low) & (body.nodes <= high)).all(axis=1)
         if not held[body.cells].all(axis=1).any():
             span = ", ".join(f"{a:.3g} to {b:.3g}" for a, b in zip(body.nodes.min(0), body.nodes.max(0)))
-            raise InputError(
-                f"clamps[{index}]", "contains no element of the body", f"The body occupies {span} m"
-            )
+            problem = "contains no element of the body"
+            raise InputError(f"clamps[{index}]", problem, f"The body occupies {span} m")
         result |= held
     if not result.any() or result.all():
         problem = "hold the whole body" if result.any() else "are missing, and nothing holds the body"

@@ -85,11 +85,7 @@ def _at_rest(model: MPM, region: MaterialRegion, state: State, copy: int) -> boo
 
 
 def ballistic(
-    model: MPM,
-    start: tuple[Tensor, ...],
-    more: Sequence[str],
-    tracers: Tensor | None,
-    frames: Sequence[int],
+    model: MPM, start: tuple[Tensor, ...], more: Sequence[str], tracers: Tensor | None, frames: Sequence[int]
 ) -> Trajectory:
     """Free flight: x_n = x0 + n dt v0 + g dt^2 n (n + 1) / 2, v_n = v0 + n dt g.
 

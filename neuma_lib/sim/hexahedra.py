@@ -8,8 +8,6 @@ integration (Malkus and Hughes 1978). Eight points for all stresses would not do
 deformations without energy.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -85,7 +83,7 @@ class Hexahedra:
     cells: NDArray[np.int64]
 
     @classmethod
-    def of_blocks(cls, planes: Sequence[Array], filled: NDArray[np.bool_]) -> Hexahedra:
+    def of_blocks(cls, planes: Sequence[Array], filled: NDArray[np.bool_]) -> "Hexahedra":
         """The mesh of filled blocks of a rectilinear grid, an element each.
 
         Args:

@@ -324,12 +324,7 @@ def forward_kernels(
                 C_new = holds[pose, clamp[p]].A
         move_particle(c, now, after, cached, step, p, v_new, C_new, x, v, C, F, F_trial, faults)
 
-    return SimpleNamespace(
-        cells=cells,
-        p2g=p2g,
-        grid_update=grid_update,
-        g2p=g2p,
-    )
+    return SimpleNamespace(cells=cells, p2g=p2g, grid_update=grid_update, g2p=g2p)
 
 
 @functools.cache

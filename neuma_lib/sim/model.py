@@ -1,7 +1,5 @@
 """Constants of a simulation: grid, time step, gravity, walls, and the laws of ranges of particles."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -115,19 +113,19 @@ class MPM:
         return tuple(each.friction for each in (*self.obstacles, *self.pairs))
 
     @cached_property
-    def frictionless(self) -> MPM:
+    def frictionless(self) -> "MPM":
         """The same model for all models that differ only in `frictions`."""
         if self.contact != "particles":
             return self
         pairs = tuple(replace(pair, friction=0.0) for pair in self.pairs)
         return replace(self.with_friction(0.0), pairs=pairs)
 
-    def with_pair_frictions(self, frictions: Sequence[float]) -> MPM:
+    def with_pair_frictions(self, frictions: Sequence[float]) -> "MPM":
         """This model with other Coulomb coefficients of its pairs of bodies."""
         pairs = zip(self.pairs, frictions, strict=True)
         return replace(self, pairs=tuple(replace(pair, friction=own) for pair, own in pairs))
 
-    def with_friction(self, friction: float, given: bool = True) -> MPM:
+    def with_friction(self, friction: float, given: bool = True) -> "MPM":
         """This model with a Coulomb coefficient of all obstacles, or only of those that stick if not ``given``.
 
         Raises:
@@ -244,10 +242,8 @@ def as_regions(law: Law | Sequence[MaterialRegion], count: int) -> tuple[Materia
     expected = 0
     for region in regions:
         if region.start != expected or region.stop <= region.start:
-            raise InputError(
-                f"region {region.law.name!r}",
-                f"particles {region.start} to {region.stop} must be a range that starts at {expected}",
-            )
+            problem = f"particles {region.start} to {region.stop} must be a range that starts at {expected}"
+            raise InputError(f"region {region.law.name!r}", problem)
         expected = region.stop
     if expected != count:
         raise InputError("regions", f"particles 0 to {expected} must be all of the {count} particles")
@@ -308,9 +304,8 @@ def _six_conditions(
     else:
         conditions = tuple(boundary)
         if len(conditions) != 6:
-            raise InputError(
-                "boundary", f"{len(conditions)} conditions must be one per wall: {', '.join(WALLS)}"
-            )
+            problem = f"{len(conditions)} conditions must be one per wall: {', '.join(WALLS)}"
+            raise InputError("boundary", problem)
     return tuple(_condition(condition, contact) for condition in conditions)
 
 
@@ -318,21 +313,16 @@ def _condition(condition: Condition, contact: str) -> Condition:
     """A valid condition for the kind of contact."""
     if isinstance(condition, str):
         if condition not in CONDITIONS:
-            raise InputError(
-                "boundary", f"{condition!r} must be one of {', '.join(CONDITIONS)}, or a Coulomb coefficient"
-            )
+            problem = f"{condition!r} must be one of {', '.join(CONDITIONS)}, or a Coulomb coefficient"
+            raise InputError("boundary", problem)
         if condition == "sticky" and contact == "particles":
-            raise InputError(
-                "boundary", "'sticky' needs contact of nodes", "Use no_slip, slip or a Coulomb coefficient"
-            )
+            problem = "'sticky' needs contact of nodes"
+            raise InputError("boundary", problem, "Use no_slip, slip or a Coulomb coefficient")
         return condition
     if isinstance(condition, bool) or not (isinstance(condition, (int, float)) and condition >= 0):
         raise InputError("boundary", f"the Coulomb coefficient {condition!r} must be a number of at least 0")
     if contact != "particles":
         remedy = f"Use {', '.join(CONDITIONS)}, or contact of particles"
-        raise InputError(
-            "boundary",
-            f"the Coulomb coefficient {condition:g} needs contact of particles, not of {contact}",
-            remedy,
-        )
+        problem = f"the Coulomb coefficient {condition:g} needs contact of particles, not of {contact}"
+        raise InputError("boundary", problem, remedy)
     return _NAMED.get(condition, float(condition))

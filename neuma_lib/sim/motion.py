@@ -1,7 +1,5 @@
 """Prescribed rigid motions of colliders and clamps."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -110,7 +108,7 @@ class Motion:
         return replace(self, **pose) if self.moves else self  # type: ignore[type-var]
 
     @cached_property
-    def _pieces(self) -> tuple[_Piece, ...]:
+    def _pieces(self) -> "tuple[_Piece, ...]":
         """Intervals of constant velocity and spin. The first also covers the time before it."""
         if not self.keyframes:
             start, velocity, spin = turned(_tensor(self.rotation)), _tensor(self.velocity), _tensor(self.spin)
@@ -123,7 +121,7 @@ class Motion:
             pieces.append(_Piece(t0, axes, centre, (next_centre - centre) / (t1 - t0), spin))
         return (*pieces, _Piece(*poses[-1], rest, rest))
 
-    def _piece(self, time: float) -> _Piece:
+    def _piece(self, time: float) -> "_Piece":
         return next((piece for piece in reversed(self._pieces) if piece.time <= time), self._pieces[0])
 
 

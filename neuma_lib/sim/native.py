@@ -1,7 +1,5 @@
 """Launches of `transfers` on a CPU for the buffers of a workspace."""
 
-from __future__ import annotations
-
 import weakref
 from typing import TYPE_CHECKING
 
@@ -34,7 +32,7 @@ class NativeTransfers:
         add_elastic: adds grad_F_elastic to grad_F.
     """
 
-    def __init__(self, ws: Workspace):
+    def __init__(self, ws: "Workspace"):
         size, model = ws.size, ws.size.model
         self._ws = weakref.proxy(ws)  # which owns this object
         self._kernels = transfer_kernels(size.dtype, ws.features)

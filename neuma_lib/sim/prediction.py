@@ -50,10 +50,8 @@ def predict(
     by_body, counts = None, ()
     if tracers is not None and start.bodies:
         owner = nearest_body(start, tracers).to(tracers.device)
-        by_body, counts = (
-            torch.argsort(owner, stable=True),
-            owner.bincount(minlength=len(start.bodies)).tolist(),
-        )
+        by_body = torch.argsort(owner, stable=True)
+        counts = owner.bincount(minlength=len(start.bodies)).tolist()
         tracers = tracers[by_body]
 
     def simulate(kept: Sequence[int]) -> Trajectory:

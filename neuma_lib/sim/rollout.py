@@ -81,10 +81,8 @@ def rollout(
 
     check_bodies(model, state)
     if tracers is not None and state.bodies and sum(tracer_bodies) != len(tracers):
-        raise InputError(
-            "tracer_bodies",
-            f"{list(tracer_bodies)} must be the numbers of tracers of each body, {len(tracers)} in all",
-        )
+        problem = f"{list(tracer_bodies)} must be the numbers of tracers of each body, {len(tracers)} in all"
+        raise InputError("tracer_bodies", problem)
 
     for region in regions:
         if region.law.grid not in (None, model.grid):
@@ -188,9 +186,8 @@ def fly_and_simulate(
     count, both = len(state.x), branched(regions, state)
     if both:
         if copies > 1:
-            raise InputError(
-                "laws", "those with a viscous part share no launches", "Simulate them one by one"
-            )
+            problem = "those with a viscous part share no launches"
+            raise InputError("laws", problem, "Simulate them one by one")
         regions, state, owners = both
     ranges = tuple((size, body) for body, size in enumerate(bodies))
     if both and bodies:  # branches belong to the bodies of their particles, in the same order
@@ -229,16 +226,7 @@ def fly_and_simulate(
         nodes, contact = copies * max(1, len(bodies)) * model.nodes**3, model.contact == "particles"
         rows = nodes // model.nodes if scatter == "native" else 0
         plan = plan_memory(
-            steps,
-            len(x),
-            nodes,
-            x.element_size(),
-            cache_bytes,
-            memory,
-            total,
-            contact,
-            rows,
-            bool(bodies),
+            steps, len(x), nodes, x.element_size(), cache_bytes, memory, total, contact, rows, bool(bodies)
         )
     simulation = Simulation(
         model, regions, slices, state, steps, first, plan, scatter, total, copies, frictions, ranges
@@ -286,9 +274,8 @@ def check_bodies(model: MPM, state: State) -> None:
     """Raise InputError unless the bodies of a state can touch each other and the pairs of the model are among them."""
     if state.bodies and (model.contact != "particles" or model.clamps):
         given = "clamps" if model.clamps else f"contact of {model.contact}"
-        raise InputError(
-            "state.bodies", f"several bodies exclude {given}", "Use contact of particles, no clamps"
-        )
+        problem = f"several bodies exclude {given}"
+        raise InputError("state.bodies", problem, "Use contact of particles, no clamps")
     count = max(1, len(state.bodies))
     if any(pair.second >= count for pair in model.pairs):
         raise InputError("pairs", f"name a body that is none of the {count} of the state")

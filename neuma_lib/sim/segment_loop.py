@@ -3,8 +3,6 @@
 Other laws run in Python between the transfers, step by step (`Simulation.step`).
 """
 
-from __future__ import annotations
-
 import math
 import weakref
 from collections.abc import Mapping, Sequence
@@ -30,7 +28,7 @@ Parts = Mapping[str, Sequence[tuple[Constitutive, slice, Weights]]]
 
 def segment_loop(
     ws: Workspace, parts: Parts, caches_steps: bool, cache_bytes: float, tracers: Repeated | None = None
-) -> SegmentLoop:
+) -> "SegmentLoop":
     """A `SegmentLoop` for these arguments, that of the last rollout in the workspace if it has the same ones."""
     given = [
         (

@@ -7,8 +7,6 @@ A step maps the state (x, v, C, F) at t to that at t + dt (paper Sec. 3.2 and Al
 The state may include the total deformation, elastic and plastic: F_total = (I + dt C) F_total.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import is_dataclass
 from typing import Any
@@ -275,7 +273,7 @@ class Simulation:
             self._loop = segment_loop(self.workspace, parts, caches_steps, self._law_cache_bytes, tracers)
 
     def _advance(
-        self, steps: int, weights: Sequence[Tensor], passive: _Tracers | None = None, first: int = 0
+        self, steps: int, weights: Sequence[Tensor], passive: "_Tracers | None" = None, first: int = 0
     ) -> None:
         """Run all steps of a segment, which starts at step `first`, and move the tracers."""
         if self._loop:

@@ -72,10 +72,8 @@ class State:
                 expected = " or ".join(map(str, allowed))
                 raise InputError(f"state.{name}", f"shape {tuple(value.shape)} must be {expected}")
             if value.dtype != x.dtype or value.device != x.device:
-                raise InputError(
-                    f"state.{name}",
-                    f"{value.dtype} on {value.device} must be {x.dtype} on {x.device}, like x",
-                )
+                problem = f"{value.dtype} on {value.device} must be {x.dtype} on {x.device}, like x"
+                raise InputError(f"state.{name}", problem)
             if not torch.isfinite(value).all():
                 raise InputError(f"state.{name}", "a value is not finite")
             if name in ("mass", "vol0", "stiffness") and not (value > 0).all():

@@ -140,10 +140,8 @@ class Workspace:
         if self.native:
             self.grid, self.grid_v, *_ = self.native.grids[:, None, :nodes]
         else:
-            self.grid, self.grid_v = (
-                self.buffer((cached, nodes), "vec4"),
-                self.buffer((cached, nodes), "vec4"),
-            )
+            self.grid = self.buffer((cached, nodes), "vec4")
+            self.grid_v = self.buffer((cached, nodes), "vec4")
         self.frictions = np.zeros((size.copies, len(size.model.frictions)))
         self.pairs = self.buffer((size.fields, size.bodies + 1), "real")
         self.obstacles = self._obstacles([0.0] * size.n_poses)
@@ -269,9 +267,7 @@ class Workspace:
         of_obstacles = self.frictions[:, : len(self.size.model.obstacles)]
         rows["friction"] = np.tile(np.minimum(of_obstacles, STICKING), (len(times), 1))
         return wp.array(
-            rows,
-            dtype=obstacle_type(self.size.dtype),
-            device=wp.device_from_torch(self.size.device),
+            rows, dtype=obstacle_type(self.size.dtype), device=wp.device_from_torch(self.size.device)
         )
 
     def _holds(self, times: Sequence[float]) -> wp.array:
@@ -542,9 +538,8 @@ class Workspace:
             )
 
 
-_POOL_SIZE = (
-    2  # one for the autograd graph of the last iteration, one for the next; and one for each further thread
-)
+# one for the autograd graph of the last iteration, one for the next; and one for each further thread
+_POOL_SIZE = 2
 _pool: list[Workspace] = []  # unused workspaces, the last used at the end
 _pool_lock = threading.RLock()  # a user can be freed in any thread
 

@@ -14,9 +14,8 @@ def check_tensors(
     first, (like, _) = next(iter(expected.items()))
     for name, (value, shape) in expected.items():
         if tuple(value.shape) != shape:
-            raise InputError(
-                f"{function}: {name}", f"has shape {tuple(value.shape)}, expected {shape}", remedy
-            )
+            problem = f"has shape {tuple(value.shape)}, expected {shape}"
+            raise InputError(f"{function}: {name}", problem, remedy)
         if value.dtype != like.dtype or value.device != like.device:
             problem = f"is {value.dtype} on {value.device}, but {first} is {like.dtype} on {like.device}"
             raise InputError(f"{function}: {name}", problem)

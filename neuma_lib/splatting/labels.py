@@ -54,9 +54,8 @@ def bodies_of(gaussians: Gaussians, cameras: Cameras, labels: Tensor, count: int
     body = share.argmax(dim=1)
     missing = [k + 1 for k in range(count) if not (body[seen] == k).any()]
     if missing:
-        raise InputError(
-            "labels", f"no Gaussian is visible as body {missing[0]}", "Check the labels of the images"
-        )
+        problem = f"no Gaussian is visible as body {missing[0]}"
+        raise InputError("labels", problem, "Check the labels of the images")
     points = gaussians.means.detach().cpu().double().numpy()
     visible = seen.cpu().numpy()
     nearest = torch.from_numpy(cKDTree(points[visible]).query(points[~visible])[1]).to(body)

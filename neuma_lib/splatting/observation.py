@@ -6,8 +6,6 @@ light and applies a gamma: in the middle of a blurred edge between black and whi
 so dark bodies look narrower by a fraction of the blur. This is neglected. Masks have no gamma.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -100,14 +98,14 @@ class Observation:
         """Images of some frames in their stored format, on the cameras' device."""
         return self.images[part].to(self.cameras.viewmats.device, non_blocking=True)
 
-    def select(self, keep: Sequence[int]) -> Observation:
+    def select(self, keep: Sequence[int]) -> "Observation":
         """The frames with the given indices."""
         keep = list(keep)
         hidden = None if self.hidden is None else self.hidden[keep]
         frames = tuple(self.frames[i] for i in keep)
         return replace(self, frames=frames, images=self.images[keep], hidden=hidden)
 
-    def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> Observation:
+    def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> "Observation":
         """The same frames on another device, with another dtype of cameras and colours.
 
         Images are moved if they take at most `_DEVICE_SHARE` of a GPU's free memory. Otherwise `stored` moves parts.

@@ -5,8 +5,6 @@ rejects requests of other web sites, and passes on only moves of the camera, dra
 the controls.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import http
@@ -22,8 +20,7 @@ import websockets.asyncio.server
 
 from neuma_lib.errors import InputError
 
-PORTS = 20
-"""Number of consecutive ports that are tried."""
+PORTS = 20  # number of consecutive ports that are tried
 MAX_BYTES = 16_384
 """Maximum size of a message. Those of a browser have less than 1 kB."""
 RATE, BURST = 200, 400

@@ -29,23 +29,15 @@ from neuma_lib.sim.model import MPM, consecutive, with_fields
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State, Trajectory
 
-FRAME = 1 / 30
-"""Target time between two frames [s], rounded to steps."""
-BUSY = 0.06
-"""Maximum computing time of a frame [s]: more than ten frames per second, with time to draw."""
-PIVOT = np.array([0.5, 0.0, 0.5])
-"""Centre of the box's rotation, on the floor [m]."""
-IDLE = 0.2
-"""Time between updates of a paused simulation [s]."""
+FRAME = 1 / 30  # target time between two frames [s], rounded to steps
+BUSY = 0.06  # maximum computing time of a frame [s]: more than ten frames per second, with time to draw
+PIVOT = np.array([0.5, 0.0, 0.5])  # centre of the box's rotation, on the floor [m]
+IDLE = 0.2  # time between updates of a paused simulation [s]
 EARTH = 9.8
-MAX_SPEED = 10.0
-"""Maximum speed of a launched or held body [m/s]."""
-_HAND = 0.08
-"""Time in which a held body reaches the pointer [s]."""
-_NEW = 0.2
-"""Weight of the last frame in running means."""
-_GAP = 1.5
-"""Distance of an added body from others and from the walls [cells]."""
+MAX_SPEED = 10.0  # maximum speed of a launched or held body [m/s]
+_HAND = 0.08  # time in which a held body reaches the pointer [s]
+_NEW = 0.2  # weight of the last frame in running means
+_GAP = 1.5  # distance of an added body from others and from the walls [cells]
 
 
 @dataclass(frozen=True)

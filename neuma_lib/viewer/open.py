@@ -1,7 +1,5 @@
 """Open the viewer on a folder of results."""
 
-from __future__ import annotations
-
 import sys
 import threading
 from collections.abc import Sequence

@@ -4,8 +4,6 @@ Frames are integers of 16 or 8 bits in the range of each component, stored as di
 bytes first, and deflated. ``page.js`` decodes them and renders the Gaussians with WebGL 2.
 """
 
-from __future__ import annotations
-
 import base64
 import io
 import json
@@ -26,8 +24,7 @@ from neuma_lib.io.files import write_text
 from neuma_lib.viewer.scalars import QUANTITIES
 from neuma_lib.viewer.scene import BODY_COLOURS, Log, Motion, Scene, View, frame_at
 
-COLOURS = {None: "viridis", 1.0: "coolwarm"}
-"""Centre of a quantity's range -> colour map."""
+COLOURS = {None: "viridis", 1.0: "coolwarm"}  # centre of a quantity's range -> colour map
 _WEBP = {"format": "WEBP", "quality": 80, "method": 4}
 _HERE = Path(__file__)
 

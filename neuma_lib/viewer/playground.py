@@ -1,7 +1,5 @@
 """Interactive simulation of a reconstructed body: the live simulation, its laws, and the bound Gaussians."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -29,8 +27,7 @@ from neuma_lib.viewer import scalars
 from neuma_lib.viewer.live import LiveSimulation, Snapshot
 from neuma_lib.viewer.scene import BODY_COLOURS
 
-ADDED_SIZE = 0.22
-"""Longest side of an added solid [m]."""
+ADDED_SIZE = 0.22  # longest side of an added solid [m]
 ADDED_PARTICLES = 500
 
 
@@ -70,11 +67,10 @@ class Playground:
         self.laws, self.roots, self.device = dict(laws), files.roots, device
         paths = [files.checked(path) for path in (files.particles, files.binding, files.gaussians)]
         first = load_reconstruction(*paths, files.density, gaussian_motion="affine").to(torch.float32)
-        start = (
-            with_motion(first, files.checked(files.velocity))
-            if files.velocity
-            else first.state((0.0, 0.0, 0.0))
-        )
+        if files.velocity:
+            start = with_motion(first, files.checked(files.velocity))
+        else:
+            start = first.state((0.0, 0.0, 0.0))
         self._density = (
             files.density if isinstance(files.density, int | float) else float(start.density.mean())
         )

@@ -1,7 +1,5 @@
 """Scalars that colour particles: speed, stress, plastic strain, volume ratio, with ranges for a legend in SI units."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
@@ -12,10 +10,8 @@ from torch import Tensor
 
 from neuma_lib.mechanics.law import Law
 
-_PERCENTILE = 99.5
-"""Upper end of a legend, robust to single detached particles."""
-_NEIGHBOURS = 16
-"""Number of nearest particles in the fit of a deformation gradient."""
+_PERCENTILE = 99.5  # upper end of a legend, robust to single detached particles
+_NEIGHBOURS = 16  # number of nearest particles in the fit of a deformation gradient
 
 
 @dataclass(frozen=True)

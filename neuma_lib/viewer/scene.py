@@ -1,7 +1,5 @@
 """Data of a viewer: Gaussians and particles of several motions of a scene, cameras and their images."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,8 +31,7 @@ BODY_COLOURS = (
     (0.90, 0.62, 0.0), (0.34, 0.71, 0.91), (0.0, 0.62, 0.45), (0.80, 0.47, 0.65), (0.0, 0.45, 0.70),
 )  # fmt: skip
 """RGB of the bodies in their order, those of Okabe and Ito (2008)."""
-_BOUND = 8
-"""Number of true particles bound to a Gaussian of the reconstruction."""
+_BOUND = 8  # number of true particles bound to a Gaussian of the reconstruction
 
 Log = Callable[[str], None]
 

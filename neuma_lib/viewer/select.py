@@ -1,7 +1,5 @@
 """A page on which a user marks the object of a capture, or a known length, in its photographs."""
 
-from __future__ import annotations
-
 import html
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The viewer's server: the motions of a scene and an interactive simulation in a browser, rendered by viser."""
 
-from __future__ import annotations
-
 import string
 import threading
 import time
@@ -32,20 +30,14 @@ BY_QUANTITY = {"particles by body": "body"} | {
     f"particles by {quantity.label}": name for name, quantity in QUANTITIES.items()
 }
 """Entry of the list "show" -> name of the quantity."""
-OFFSET = 1.15
-"""Offset of the second box from the first [m]."""
+OFFSET = 1.15  # offset of the second box from the first [m]
 PACES = {"1/32": 1 / 32, "1/16": 1 / 16, "1/8": 1 / 8, "1/4": 1 / 4, "real time": 1.0}
-MAX_RATE = 15
-"""Maximum number of frames sent per second."""
-_POLL = 0.05
-"""Time to wait for a new snapshot [s]."""
-_TEXT_TIME = 0.5
-"""Minimum time between updates of the status text [s], for legibility."""
+MAX_RATE = 15  # maximum number of frames sent per second
+_POLL = 0.05  # time to wait for a new snapshot [s]
+_TEXT_TIME = 0.5  # minimum time between updates of the status text [s], for legibility
 _FRUSTUM = 0.12
-_AXES = 0.15
-"""Length of the axes [m]."""
-_HANDLE = 0.55
-"""Radius of the handle for dragging, in longest sides of the body."""
+_AXES = 0.15  # length of the axes [m]
+_HANDLE = 0.55  # radius of the handle for dragging, in longest sides of the body
 
 
 def viser() -> ModuleType:
@@ -80,9 +72,8 @@ class ViewerServer:
             )
         if self.port != gate.port:
             self.server.stop()
-            raise InputError(
-                "viser", f"release {self.viser.__version__} is not supported", "Install viser 1.1.1"
-            )
+            problem = f"release {self.viser.__version__} is not supported"
+            raise InputError("viser", problem, "Install viser 1.1.1")
         self._closing, self._dirty, self._playing = threading.Event(), True, False
         self._clock, self._number, self._nodes = 0.0, -1, {}
         self._reach: dict[tuple[str, str], float] = {}

@@ -1,17 +1,13 @@
 """A room in Blender: textured rectangles, lamps and a moving body. Imports bpy and is used through `room`."""
 
-from __future__ import annotations
-
 import bpy
 import numpy as np
 from mathutils import Matrix, Vector
 
 from neuma_lib.data.blender import cycles
 
-SENSOR = 36.0
-"""Width of the sensor of all cameras [mm]; only its ratio to the pixels matters."""
-PER_SECOND = 24.0
-"""Blender's frames per second; the shutter time is a fraction of a frame."""
+SENSOR = 36.0  # width of the sensor of all cameras [mm]; only its ratio to the pixels matters
+PER_SECOND = 24.0  # Blender's frames per second; the shutter time is a fraction of a frame
 
 
 def start(job: dict[str, np.ndarray]) -> None:

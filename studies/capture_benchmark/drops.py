@@ -1,7 +1,5 @@
 """Ground-truth motion of a drop."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

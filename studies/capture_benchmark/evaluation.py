@@ -1,7 +1,5 @@
 """Compare results of the pipeline for a demo capture with the ground truth, in metres of the simulation box."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,10 +17,8 @@ from neuma_lib.geometry.skinning import skinning_matrix
 from neuma_lib.io.images import read_image_set, read_transforms
 from studies.capture_benchmark.room import Moving
 
-FINER = 4
-"""Supersampling factor of silhouettes."""
-EVERY = 4
-"""Stride of the video frames that are compared with true silhouettes."""
+FINER = 4  # supersampling factor of silhouettes
+EVERY = 4  # stride of the video frames that are compared with true silhouettes
 
 
 @dataclass(frozen=True)

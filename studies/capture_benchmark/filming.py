@@ -1,7 +1,5 @@
 """Photographs and videos of the demo captures: renders of Blender with a camera's exposure and noise."""
 
-from __future__ import annotations
-
 import subprocess
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -19,18 +17,14 @@ from studies.capture_benchmark.room import Moving, Scenery, Shot, shoot
 from studies.capture_benchmark.settings import DemoCapturesConfig, DemoObjectConfig, DemoRoomConfig
 from studies.capture_benchmark.stage import MIDDLE, Eye, lens_row, video_cameras
 
-PAPER = 0.0004
-"""Height of the page above the floor, which separates the two surfaces [m]."""
-MARGIN = 10
-"""Margin of the rendered regions around the body and its shadow [px]."""
+PAPER = 0.0004  # height of the page above the floor, which separates the two surfaces [m]
+MARGIN = 10  # margin of the rendered regions around the body and its shadow [px]
 START = 15_000
 """Overhead of a rendered region, in pixels. Two regions are merged if that is cheaper."""
 EVERY = 5
 """Stride of the vertices that bound the body. Vertices are some millimetres apart."""
-RIM = 8
-"""Points of a lamp's rim from which shadows are cast."""
-WALL_TEXEL = 2.0
-"""Side of a wall's pixels, in pixels of the floor."""
+RIM = 8  # points of a lamp's rim from which shadows are cast
+WALL_TEXEL = 2.0  # side of a wall's pixels, in pixels of the floor
 
 
 def scenery(

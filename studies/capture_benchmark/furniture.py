@@ -1,7 +1,5 @@
 """What makes a room ordinary: furniture, a ruler instead of the board, a second object in motion, and marks by hand."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -17,10 +15,8 @@ RULER = (0.40, 0.03, 0.001)
 """Length, width, and side of a pixel of the ruler that lies in place of the board [m]."""
 NEAR, FREE = (0.52, 0.8), 0.3
 """Distances of low pieces from the middle, and from the middles of object and board [m]."""
-TEXEL = 0.002
-"""Side of a pixel of furniture [m]."""
-BORDER = 12
-"""Distance of marks from the border of a photograph [px]."""
+TEXEL = 0.002  # side of a pixel of furniture [m]
+BORDER = 12  # distance of marks from the border of a photograph [px]
 
 
 def furniture(

@@ -1,16 +1,12 @@
 """Textures of floors and walls with many distinct SIFT features."""
 
-from __future__ import annotations
-
 import numpy as np
 from PIL import Image, ImageDraw
 
 LARGEST, SMALLEST = 0.10, 0.006
 """Radii of the shapes [m]."""
-MIN_RADIUS = 1.5
-"""Smallest radius that is drawn [px]."""
-COVER = 1.8
-"""Mean number of shapes that cover a point."""
+MIN_RADIUS = 1.5  # smallest radius that is drawn [px]
+COVER = 1.8  # mean number of shapes that cover a point
 SIZES = 14
 """Number of sizes, evenly spaced in the logarithm. Small shapes are drawn over large ones."""
 BLACK, WHITE = 28, 225

@@ -1,7 +1,5 @@
 """Settings and file lists of the demo captures, known before their files exist."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

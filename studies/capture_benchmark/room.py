@@ -1,7 +1,5 @@
 """Render images of a room with a moving body, in a separate Blender process (`room_worker`)."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

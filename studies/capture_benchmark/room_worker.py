@@ -3,8 +3,6 @@
 Prints the number of finished shots on standard output, one line per shot, and writes each to ``<number>.npy``.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -10,8 +10,6 @@ report of the method `constants`. Only the comparison reads the truth. Results a
 and as a table to standard output.
 """
 
-from __future__ import annotations
-
 import argparse
 import re
 import resource
@@ -31,19 +29,14 @@ from neuma_lib.io.files import read_json, write_json, write_text
 from neuma_lib.io.images import read_transforms
 from neuma_lib.paper.identified_table import FITS, MATERIAL, compare_family, compare_quantities
 from neuma_lib.project.loading import read_yaml
-from studies.capture_benchmark.evaluation import (
-    compare_cameras,
-    photograph_agreement,
-    video_agreement,
-)
+from studies.capture_benchmark.evaluation import compare_cameras, photograph_agreement, video_agreement
 from studies.capture_benchmark.planned import PREFIX
 from studies.capture_benchmark.sets import body_at_rest, body_of_drop
 from studies.capture_benchmark.settings import DemoCapturesConfig
 
 SETTINGS = Path("studies/capture_benchmark/rooms.yaml")
 REPORT = "constants/report.html"
-DEVIATIONS = 2.0
-"""Half width of the band around a constant, in standard deviations of the logarithm."""
+DEVIATIONS = 2.0  # half width of the band around a constant, in standard deviations of the logarithm
 
 
 def main() -> None:

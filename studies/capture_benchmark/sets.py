@@ -1,7 +1,5 @@
 """Files and bodies of the demo captures that the pipeline does not read: the room, and the body in Blender."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -4,8 +4,6 @@ The world is the simulation box: y up, the floor at y = 0, x along the board's w
 in the settings are relative to the middle of the floor.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -22,12 +20,9 @@ from studies.capture_benchmark.settings import (
     LensConfig,
 )
 
-MIDDLE = np.array([0.5, 0.0, 0.5])
-"""The middle of the floor in the simulation box [m]."""
-POLYNOMIAL = 4
-"""Degree of the lens polynomial, from distance in the picture to angle."""
-BEYOND = 1.05
-"""Range of the polynomial fit, relative to the distance of the picture's corners."""
+MIDDLE = np.array([0.5, 0.0, 0.5])  # the middle of the floor in the simulation box [m]
+POLYNOMIAL = 4  # degree of the lens polynomial, from distance in the picture to angle
+BEYOND = 1.05  # range of the polynomial fit, relative to the distance of the picture's corners
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,11 +128,11 @@ class Pose:
     def apply(self, points: np.ndarray) -> np.ndarray:
         return points @ self.rotation.T + self.translation
 
-    def after(self, first: Pose) -> Pose:
+    def after(self, first: "Pose") -> "Pose":
         """The composition: first ``first``, then this one."""
         return Pose(self.rotation @ first.rotation, self.rotation @ first.translation + self.translation)
 
-    def inverse(self) -> Pose:
+    def inverse(self) -> "Pose":
         return Pose(self.rotation.T, -self.rotation.T @ self.translation)
 
     def plain(self) -> dict:

@@ -1,7 +1,5 @@
 """Ground truth of a demo capture, as plain values."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

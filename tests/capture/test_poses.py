@@ -162,9 +162,7 @@ def test_room_from_a_stated_length():
     object_points = rng.uniform([0.05, 0.08, 0.02], [0.13, 0.16, 0.1], (200, 3))
     base = reconstruction(world.move_cameras(true))
     base = poses.replace(
-        base,
-        points=world.apply(np.concatenate([floor, object_points])),
-        colours=np.zeros((600, 3), np.uint8),
+        base, points=world.apply(np.concatenate([floor, object_points])), colours=np.zeros((600, 3), np.uint8)
     )
     ends = np.array([[0.02, 0.1, 0.0], [0.02, 0.1, 0.15]])
     marks = {f"{i}.png": LENS.project(ends @ true[i][:3, :3].T + true[i][:3, 3]).tolist() for i in (0, 2, 4)}

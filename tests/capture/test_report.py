@@ -112,10 +112,7 @@ def test_names_and_texts_are_escaped(whole, tmp_path):
         "warnings": [NASTY],
         "checks": {NASTY: [Check(NASTY, NASTY, NASTY, True)]},
         "pictures": {NASTY: {NASTY: tmp_path / "sheet.png", NASTY + " ": tmp_path / "none.png"}},
-        "films": [
-            Film(NASTY, NASTY, True, tmp_path / "left.mp4", NASTY),
-            Film(NASTY, NASTY, True, None),
-        ],
+        "films": [Film(NASTY, NASTY, True, tmp_path / "left.mp4", NASTY), Film(NASTY, NASTY, True, None)],
         "rows": [row(take=NASTY, camera=NASTY, title=NASTY)],
         "identified": identified(family=NASTY, ties=[NASTY]),
     }
@@ -233,10 +230,7 @@ def test_a_capture_without_faults_has_no_warnings():
             {"flight": {**GOOD_FLIGHT, "row_delay_s": {"left": 2e-3, "right": 1e-4}}},
             "no row_time.*at most 4.0 mm for left at",
         ),
-        (
-            {"prediction": {**GOOD_MOTION, "frames_after_contact": {"left": 3}}},
-            "one, left: only 3 frames",
-        ),
+        ({"prediction": {**GOOD_MOTION, "frames_after_contact": {"left": 3}}}, "one, left: only 3 frames"),
         ({"prediction": {**GOOD_MOTION, "touched": ["x_min"]}}, "touches the box .x_min."),
         ({"registration": {"ambiguous": "it looks alike"}}, "does not determine the pose .*: it looks alike"),
     ],

@@ -50,10 +50,8 @@ def measured(scene, **changes):
 def test_measures_are_those_of_pictures_that_are_put_together_by_hand(scene):
     result = measured(scene)
     alpha, mask = scene["alpha"].numpy()[..., None], scene["matte"].numpy()[..., 3:]
-    predicted, filmed = (
-        scene["colours"].numpy() + 1 - alpha,
-        scene["matte"].numpy()[..., :3] * mask + 1 - mask,
-    )
+    predicted = scene["colours"].numpy() + 1 - alpha
+    filmed = scene["matte"].numpy()[..., :3] * mask + 1 - mask
     window = object_window((alpha[..., 0] > 0.05) | (mask[..., 0] > 0.05), 0.1)
     assert result["psnr"] == pytest.approx(psnr(predicted[window], filmed[window]), abs=1e-4)
     assert result["ssim"] == pytest.approx(ssim(predicted[window], filmed[window]), abs=1e-5)

@@ -5,13 +5,7 @@ import pytest
 from PIL import Image, ImageOps
 
 from neuma_lib.capture.calibration.placement import Similarity, camera_centres, fit_floor
-from neuma_lib.capture.calibration.vertical import (
-    QUARTER_TURNS,
-    Cue,
-    camera_cues,
-    check_vertical,
-    read_cues,
-)
+from neuma_lib.capture.calibration.vertical import QUARTER_TURNS, Cue, camera_cues, check_vertical, read_cues
 from neuma_lib.capture.pictures import ORIENTATION
 from tests.support.errors import refused
 from tests.support.similarities import random_similarity

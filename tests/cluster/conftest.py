@@ -21,8 +21,7 @@ def slurm():
         pytest.fail(f"SLURM: {problem}", pytrace=False)
     if importlib.util.find_spec(PLUGIN) is None:
         pytest.fail(
-            f"{sys.executable} has no {PLUGIN}: see the head of profiles/slurm/config.yaml",
-            pytrace=False,
+            f"{sys.executable} has no {PLUGIN}: see the head of profiles/slurm/config.yaml", pytrace=False
         )
     with cluster(gpus=1, min_job_age=86400) as running, pytest.MonkeyPatch.context() as patch:
         for name, value in running.environment.items():

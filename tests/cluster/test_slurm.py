@@ -4,8 +4,6 @@ One host, no cgroups, no accounting database and no GPU: what a second host, a f
 would change is not tested. These tests check the table, what a SLURM job requests, and how it ends.
 """
 
-from __future__ import annotations
-
 import re
 import signal
 import subprocess

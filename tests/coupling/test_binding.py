@@ -1,7 +1,5 @@
 """Binding: the sparse search against Algorithm 1 written out, and what added particles must not change."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

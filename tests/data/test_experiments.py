@@ -1,7 +1,5 @@
 """Several bodies on one grid, coloured solids, and densities that differ inside a body."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -217,10 +215,7 @@ def test_a_start_has_the_densities_and_motions_of_its_bodies(tmp_path):
     save_particles(tmp_path / "p.h5", both.x0, both.vol0, {})
     still, pivot = {"angular_velocity": [0, 0, 0], "centre": None}, [0.6, 0.5, 0.5]
     spinning = {"v0": [0, 0, 2.0], "angular_velocity": [0, 3.0, 0], "centre": pivot}
-    starts = [
-        {"v0": [1.0, 0, 0], **still, "particles": half},
-        {**spinning, "particles": len(both.x0) - half},
-    ]
+    starts = [{"v0": [1.0, 0, 0], **still, "particles": half}, {**spinning, "particles": len(both.x0) - half}]
     files = [tmp_path / name for name in ("p.h5", "b.h5", "g.ply", "v.json")]
     write_json(files[-1], {"bodies": starts})
     start, counts = load_initial_state(*files, [1000.0, {**SPLIT, "axis": "y"}])

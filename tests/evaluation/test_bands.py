@@ -1,7 +1,5 @@
 """Bands of responses: they have the stated coverage for linear problems, and are wide without data."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

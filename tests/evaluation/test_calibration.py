@@ -1,7 +1,5 @@
 """Calibrated intervals have the stated coverage for errors of another distribution than the normal one."""
 
-from __future__ import annotations
-
 import math
 from statistics import NormalDist
 

@@ -1,7 +1,5 @@
 """Scores of intervals and probabilities, and their confidence over scenes."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Evaluation of predicted motions with known errors."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -22,8 +20,7 @@ pytestmark = pytest.mark.core
 
 V0 = torch.tensor([0.3, -1.5, 0.1], dtype=torch.float64)
 LAW = analytic_law(TRUTH, MODEL.dt)
-IN_FLIGHT = [0, 5, 10, 20]
-"""Frames before the ball of `ball()` touches the floor."""
+IN_FLIGHT = [0, 5, 10, 20]  # frames before the ball of `ball()` touches the floor
 
 
 def in_ball(count: int, seed: int, height: float = HEIGHT) -> torch.Tensor:

@@ -1,7 +1,5 @@
 """Image measures: their window, LPIPS compared with the authors' package, and weights read without running code."""
 
-from __future__ import annotations
-
 import io
 import os
 import pickle

@@ -1,7 +1,5 @@
 """Measures compared with their definitions, and the tables and videos that contain them."""
 
-from __future__ import annotations
-
 import math
 
 import imageio.v2 as imageio

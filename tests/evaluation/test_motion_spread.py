@@ -1,7 +1,5 @@
 """Uncertainty of a motion that is predicted with identified constants."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Errors of stresses with closed forms, states of a motion, and the table with its claims."""
 
-from __future__ import annotations
-
 import csv
 import io
 import math

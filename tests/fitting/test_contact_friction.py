@@ -28,8 +28,7 @@ ROUGH = MPM(grid=16, dt=2e-3, contact="particles")
 V0 = (1.0, -0.7, 0.0)
 FRAMES = tuple(range(0, 121, 8))
 TRUTH = {"E": 6e4, "nu": 0.3}
-NOISE = 0.01
-"""Standard deviation of a colour."""
+NOISE = 0.01  # standard deviation of a colour
 SETTINGS = IdentifyConfig(
     families={"hencky": LawConfig(**law("hencky", E=2e5))},
     pyramid=(4, 8, 32),

@@ -976,11 +976,9 @@ def test_updated_derivatives_reach_the_same_minimum_with_fewer_differentiations(
 def test_a_rough_fit_and_a_hopeless_one_differentiate_less():
     """A rough fit ends with updated derivatives near the minimum, one beyond the limit of the cost at once."""
     none = lambda fit: np.zeros((2, 2))  # noqa: E731
-    targets, problem, hopeless = (
-        np.array([3.0, 0.5, 0.2]),
-        Bend(np.array([3.0, 0.5, 0.2])),
-        Bend(np.array([3.0, 0.5, 9.0])),
-    )
+    targets = np.array([3.0, 0.5, 0.2])
+    problem = Bend(np.array([3.0, 0.5, 0.2]))
+    hopeless = Bend(np.array([3.0, 0.5, 9.0]))
     exact, _, _ = levenberg_marquardt(Bend(targets), np.zeros(2), [0, 1], none, 1e-14, 40)
     u, fit, _ = levenberg_marquardt(problem, np.zeros(2), [0, 1], none, 1e-6, 40, secant=True, rough=True)
     assert not fit.exact and problem.differentiated == 1

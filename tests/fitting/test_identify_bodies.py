@@ -15,7 +15,7 @@ from neuma_lib.fitting.identify_bodies import identify_bodies
 from neuma_lib.fitting.video_residuals import Candidate, VideoResiduals
 from neuma_lib.io.files import write_json
 from neuma_lib.mechanics.analytic import analytic_law
-from neuma_lib.mechanics.combinations import named_combinations
+from neuma_lib.mechanics.combinations import constants_of, named_combinations
 from neuma_lib.sim.bodies import Pair
 from neuma_lib.sim.model import consecutive
 from neuma_lib.sim.rollout import rollout
@@ -75,10 +75,7 @@ def check_constants(result):
     ((friction, log_std),) = result.pairs.values()
     assert friction == pytest.approx(FRICTION, abs=0.05) and abs(np.log(friction / FRICTION)) < 3 * log_std
     for name, each in result.bodies.items():
-        constants = {
-            key: value for part in TRUTH[name].values() for key, value in part.items() if key != "name"
-        }
-        truth, determined = named_combinations(constants), 0
+        truth, determined = named_combinations(constants_of(TRUTH[name])), 0
         for key, value, std in each.best.quantities(each.settings):
             if std < each.settings.determined:
                 assert value == pytest.approx(truth[key], rel=0.15), (name, key)

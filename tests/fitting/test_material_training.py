@@ -7,12 +7,7 @@ import torch
 from neuma_lib.config.training import TrainingConfig
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import NonFiniteError
-from neuma_lib.fitting.material import (
-    ParticleLoss,
-    PixelLoss,
-    frame_weights,
-    train_material,
-)
+from neuma_lib.fitting.material import ParticleLoss, PixelLoss, frame_weights, train_material
 from neuma_lib.mechanics.neural import neural_law
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State

@@ -1,7 +1,5 @@
 """Surface from silhouettes, points in volumes: overlap with the truth, counts, evenness, invalid input."""
 
-from __future__ import annotations
-
 import dataclasses
 import resource
 

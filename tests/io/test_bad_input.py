@@ -34,8 +34,7 @@ from tests.support.splat_files import ball
 
 pytestmark = pytest.mark.core
 
-HUGE = 2**26
-"""Zeros that archives below hide [bytes]."""
+HUGE = 2**26  # zeros that archives below hide [bytes]
 MEMORY = HUGE / 2
 """Maximum of a refusal [bytes]. The headers below claim 64 MiB to 22 TiB."""
 

@@ -14,13 +14,7 @@ from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.io.files import atomic, read_json, write_json
 from neuma_lib.io.gaussians import load_gaussians, save_gaussians
 from neuma_lib.io.hdf5 import read_arrays, write_arrays
-from neuma_lib.io.images import (
-    list_body,
-    load_observation,
-    read_hidden,
-    read_image_set,
-    write_transforms,
-)
+from neuma_lib.io.images import list_body, load_observation, read_hidden, read_image_set, write_transforms
 from neuma_lib.io.mesh import read_mesh, write_mesh
 from neuma_lib.io.particles import with_motion
 from neuma_lib.io.ply import read_ply, write_ply

@@ -53,8 +53,7 @@ def assert_close(read, expected, mean, scale, angle, opacity, sh0, shN=0.0):
     assert expected.shN.numel() == 0 or (read.shN - expected.shN).abs().max() <= shN
 
 
-HALF = 0.5 * (1 + 1e-3)
-"""Of a level of a quantised value, and what is lost in float32."""
+HALF = 0.5 * (1 + 1e-3)  # of a level of a quantised value, and what is lost in float32
 
 
 def angle_of(error, largest=0.71):

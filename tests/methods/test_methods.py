@@ -143,10 +143,8 @@ def test_identified_friction_moves_the_body(name, record, friction, tmp_path):
     if name == "constants":
         files = {"identified": identified(tmp_path / "identified.json", contact_friction=record)}
     else:
-        law, files = (
-            structured_law({**SPEC, "form": "stretch"}, DT, seed=0),
-            {"adaptor": str(tmp_path / "a.safetensors")},
-        )
+        law = structured_law({**SPEC, "form": "stretch"}, DT, seed=0)
+        files = {"adaptor": str(tmp_path / "a.safetensors")}
         about = {"stable": True, "contact_friction": record}
         save_adaptor(files["adaptor"], trained(law), 2, 4.0, about)
     x = {}

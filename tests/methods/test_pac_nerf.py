@@ -304,8 +304,7 @@ def test_published_guesses_are_those_of_the_authors(loaded):
 
 
 @pytest.mark.parametrize(
-    "prior, family",
-    [("jelly", "elastic"), ("plasticine", "plasticine"), ("sand", "sand")],
+    "prior, family", [("jelly", "elastic"), ("plasticine", "plasticine"), ("sand", "sand")]
 )
 def test_family_is_that_of_the_prior(prior, family, loaded):
     law = loaded.priors.laws[prior].plain()

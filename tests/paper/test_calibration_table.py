@@ -1,7 +1,5 @@
 """The table of calibration: it holds for synthetic scenes of known coverage, and does not when a quantile is wrong."""
 
-from __future__ import annotations
-
 import csv
 import io
 

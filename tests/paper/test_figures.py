@@ -1,7 +1,5 @@
 """Figures are drawn from their data in print quality. Particles, crops and tests of material points are correct."""
 
-from __future__ import annotations
-
 import ast
 import json
 import re
@@ -31,13 +29,7 @@ from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.methods.registry import built_in_presets
 from neuma_lib.paper.figures import ablation_gradients, ch_dist_curve, image_quality, material_response
 from neuma_lib.paper.figures.lora_alphav import monotone_frames
-from neuma_lib.paper.image_grid import (
-    TITLE,
-    ImageGrid,
-    broken,
-    load_image_grid,
-    save_image_grid,
-)
+from neuma_lib.paper.image_grid import TITLE, ImageGrid, broken, load_image_grid, save_image_grid
 from neuma_lib.splatting.cameras import Cameras
 from tests.support.errors import refused
 

@@ -3,8 +3,6 @@
 After an intended change of a text, run ``python -m tests.paper.test_golden`` and inspect the difference.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

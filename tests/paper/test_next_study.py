@@ -38,10 +38,8 @@ def fit(rank, kind, std, predicted, error=0.1):
 def test_the_page_has_the_measures_of_the_issue(materials):
     """One material: the choice leaves a half of the mean random launch, and twice the best in hindsight."""
     name, settings = next((n, own) for n, own in materials.items() if own.random.family(n) == "hencky")
-    chosen, launches = (
-        fit(0, "press", 0.1, 0.05),
-        [fit(1, "launch", 0.2, 0.2, 0.2), fit(2, "launch", 0.2, 0.2, 0.2)],
-    )
+    chosen = fit(0, "press", 0.1, 0.05)
+    launches = [fit(1, "launch", 0.2, 0.2, 0.2), fit(2, "launch", 0.2, 0.2, 0.2)]
     best = fit(3, "hang", 0.05, 0.1, 0.3)
     alone = {"std": {"G": 0.4, "K": 1.6}}
     pools = [{"alone": alone, "candidates": own} for own in ([best, chosen], launches)]

@@ -1,7 +1,5 @@
 """Recording updates numbers of pages from tables and figures, and nothing else. The pages agree with the records."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import sys

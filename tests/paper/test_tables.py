@@ -1,7 +1,5 @@
 """Tables of errors: their numbers, notes, and verdicts on the paper's claims."""
 
-from __future__ import annotations
-
 import csv
 import io
 from pathlib import Path

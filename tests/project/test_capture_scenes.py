@@ -205,8 +205,10 @@ def test_other_scenes_need_a_truth():
 
 def test_rows_are_read_in_turn():
     frames = [{"time": 0.1 * k, "h": 50} for k in range(3)]
-    times = frame_times(frames, np.array([0.0, 25.0, 50.0]), 1e-5, 1000)
-    np.testing.assert_allclose(times, [0.0, 0.105, 0.21])
+    mattes = np.zeros((3, 50, 4, 4), np.uint8)
+    mattes[range(3), (0, 24, 49)] = 255  # centres at half integers
+    times = frame_times(frames, mattes, 1e-5, 1000)
+    np.testing.assert_allclose(times, [0.0001, 0.1049, 0.2099])
 
 
 def test_frames_are_spread_over_the_time_after_the_start():

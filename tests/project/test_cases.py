@@ -59,7 +59,7 @@ def test_options_are_layers_of_section_scene_preset_and_variant(changed):
 
 def test_built_in_presets_can_be_changed_and_added_to(changed):
     loaded = changed(
-        methods={"neuma": {"title": "Mine"}, "low": {"kind": "neuma", "title": "L", "options": {"rank": 2}}},
+        methods={"neuma": {"title": "Mine"}, "low": {"kind": "neuma", "title": "L", "options": {"rank": 2}}}
     )
     assert cases.title(loaded, "neuma") == "Mine"
     assert cases.case(loaded, "BouncyBall", "low").options.rank == 2

@@ -106,7 +106,7 @@ def test_videos_of_one_law_share_their_obstacles(with_colliders, changed):
     with refused("scenes.Steps.videos", problem="colliders"):
         case(other, "Steps", "neuma").each_video(lambda case: case.scene)
     again = changed(
-        scenes={"Steps": {"like": "BouncyBall", "colliders": [STEP], "videos": [{"velocity": [0, 0, 1]}]}},
+        scenes={"Steps": {"like": "BouncyBall", "colliders": [STEP], "videos": [{"velocity": [0, 0, 1]}]}}
     )
     assert again.obstacles("Steps_throw2") == again.obstacles("Steps")
 

@@ -21,8 +21,7 @@ from tests.support import hanging_beam as beam
 from tests.support.errors import refused
 
 pytestmark = pytest.mark.core
-FLOOR = Clamp((-1.0, -1.0, -1.0), (0.0, 1.0, 1.0))
-"""Holds x <= 0."""
+FLOOR = Clamp((-1.0, -1.0, -1.0), (0.0, 1.0, 1.0))  # holds x <= 0
 
 
 def law(mu=93.0, nu=0.49, name="neo_hookean"):
@@ -79,11 +78,9 @@ def test_an_affine_deformation_has_no_forces_inside(nu):
 
 def test_the_tangent_is_the_derivative_of_the_forces():
     body, rng = sheared(bar((2, 1, 2))), np.random.default_rng(2)
-    x, direction, step = (
-        body.nodes + 2e-4 * rng.normal(size=body.nodes.shape),
-        rng.normal(size=body.nodes.shape),
-        1e-7,
-    )
+    x = body.nodes + 2e-4 * rng.normal(size=body.nodes.shape)
+    direction = rng.normal(size=body.nodes.shape)
+    step = 1e-7
     for name in ("neo_hookean", "ogden"):
         spec = {"name": name, "E": 200.0, "nu": 0.45} | ({"alpha": 6.0} if name == "ogden" else {})
         own = Law.from_spec({"elasticity": spec})

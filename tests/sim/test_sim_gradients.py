@@ -22,8 +22,7 @@ ON_A_STICKY_FLOOR = MPM(
     14, DT, boundary={"y_min": "sticky"}, contact="nodes"
 )  # stops its nodes always: no switch
 ON_A_RELEASED_FLOOR = MPM(14, DT, boundary={"y_min": "sticky"}, contact="released")
-TOUCHING = 0.12
-"""Height [m] at which the cube of `scene` is in the floor."""
+TOUCHING = 0.12  # height [m] at which the cube of `scene` is in the floor
 COUNT = 60
 MOTION = ("x", "v", "F", "C")
 

@@ -177,8 +177,7 @@ def bounce(grid: int, contact: str, E: float = 3e4) -> tuple[float, float]:
     return (float(y[:top].min()) - radius) * grid, float(y[top].mean())
 
 
-DEEPEST = {"particles": -0.25, "nodes": -0.75}
-"""Bound of the lowest place of `bounce` [cells]."""
+DEEPEST = {"particles": -0.25, "nodes": -0.75}  # bound of the lowest place of `bounce` [cells]
 
 
 @pytest.mark.parametrize("contact", DEEPEST)

@@ -1,7 +1,5 @@
 """From particles to the image loss: fused kernels against plain torch, and parts of frames against all at once."""
 
-from __future__ import annotations
-
 import weakref
 
 import pytest

@@ -1,7 +1,5 @@
 """Checks of errors by their fields, so that texts may change."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 

@@ -1,7 +1,5 @@
 """A coloured body of Gaussians that falls, spinning, in front of cameras that differ in gain, offset and noise."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What several tests share of geometry."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 import trimesh

@@ -1,7 +1,5 @@
 """A small grounding problem without files: a soft ball or block that a camera watches, with its motion known."""
 
-from __future__ import annotations
-
 import torch
 
 from neuma_lib.coupling.particle_binding import bind_two_pass
@@ -17,8 +15,7 @@ MODEL = MPM(grid=16, dt=2e-3)
 TRUTH = {"elasticity": {"name": "fixed_corotated", "E": 3e4, "nu": 0.3}, "plasticity": {"name": "identity"}}
 PRIOR = {"elasticity": {"name": "fixed_corotated", "E": 1e5, "nu": 0.2}, "plasticity": {"name": "identity"}}
 RADIUS = 0.13
-HEIGHT = 0.28
-"""Of the centre of the ball at the start [m]."""
+HEIGHT = 0.28  # of the centre of the ball at the start [m]
 
 
 def ball(

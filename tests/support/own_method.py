@@ -1,7 +1,5 @@
 """A modulus from the mean brightness of the video: of no use, but short."""
 
-from __future__ import annotations
-
 from pydantic import Field
 
 from neuma_lib.config.motion import MotionOptions

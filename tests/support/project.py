@@ -1,7 +1,5 @@
 """A copy of the project in its own folder, run by real Snakemake on the settings of tiny.yaml."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import re
@@ -77,7 +75,7 @@ class Plan(Counter):
         super().__init__(job.rule for job in self.jobs)
 
     @classmethod
-    def of(cls, output: str, requested: Iterable[str] = ()) -> Plan:
+    def of(cls, output: str, requested: Iterable[str] = ()) -> "Plan":
         """Jobs that Snakemake prints. Raises AssertionError if these are not all that it counts."""
         blocks = re.findall(r"^(?:local)?rule (\w+):\n((?:    .*\n)*)", output, re.MULTILINE)
         plan = cls((Job(*block) for block in blocks), requested)
@@ -99,7 +97,7 @@ class Plan(Counter):
         """The job of each output; a target rule is its own output."""
         return {name: job for job in self.jobs for name in job.outputs or [job.rule]}
 
-    def behind(self, *targets: str) -> Plan:
+    def behind(self, *targets: str) -> "Plan":
         """The jobs that a dry run of these targets alone would have, with the present files."""
         unknown = {*targets} - self.makers.keys() - self.requested
         assert not unknown, unknown
@@ -190,7 +188,7 @@ class Project:
         kept = {str(f.relative_to(self.root)): f for f in files if not {"logs", "benchmarks"} & set(f.parts)}
         return {name: hashlib.sha256(f.read_bytes()).hexdigest() for name, f in sorted(kept.items())}
 
-    def clone(self, root: Path) -> Project:
+    def clone(self, root: Path) -> "Project":
         """A copy of the project as it stands, with everything computed and Snakemake's records."""
         shutil.copytree(self.root, root)
         return Project(root.resolve(), self.executor, self.seconds)

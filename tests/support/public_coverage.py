@@ -4,8 +4,6 @@ Public are the names of `neuma_lib` and the names without underscore of the modu
 functions below 90 %, and fails if all of them together are below.
 """
 
-from __future__ import annotations
-
 import inspect
 import json
 import re

@@ -1,7 +1,5 @@
 """What several tests share of binding."""
 
-from __future__ import annotations
-
 import torch
 
 

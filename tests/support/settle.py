@@ -1,7 +1,5 @@
 """State at rest under gravity, as the start of a motion."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Alpha mattes of meshes without a renderer: projected faces filled on a finer raster, then averaged."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 

@@ -9,8 +9,6 @@ a job may use is still enforced, memory by checks of its processes (``OverMemory
 GPUs are empty files: jobs ask and wait for them, and find none.
 """
 
-from __future__ import annotations
-
 import argparse
 import getpass
 import os

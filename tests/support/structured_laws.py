@@ -2,10 +2,7 @@
 
 import torch
 
-from neuma_lib.mechanics.structured import (
-    FORMS,
-    structured_law,
-)
+from neuma_lib.mechanics.structured import FORMS, structured_law
 from tests.support.deformations import EYE, deformations, rotations
 
 E, NU, DT = 1e5, 0.3, 1e-3

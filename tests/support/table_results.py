@@ -1,7 +1,5 @@
 """What several tests share of tables."""
 
-from __future__ import annotations
-
 
 def run(value, **extra):
     return {

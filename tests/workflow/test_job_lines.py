@@ -1,7 +1,5 @@
 """One line a finished job, and the end of a failed job's log."""
 
-from __future__ import annotations
-
 import logging
 import subprocess
 import sys

@@ -105,8 +105,7 @@ class TestThisProject:
         assert not [name for name in reached if name.split(".")[1] in rooms]
 
     @pytest.mark.parametrize(
-        "script",
-        ["ground_truth", "prior", "sampled_particles", "render", "chamfer_table"],
+        "script", ["ground_truth", "prior", "sampled_particles", "render", "chamfer_table"]
     )
     def test_what_does_not_render_is_free_of_it(self, script):
         assert "neuma_lib.splatting.rasterizer" not in self.reached(script)
@@ -185,8 +184,7 @@ def test_edits_rerun_what_depends_on_them(jobs_with_code, file, runs, spared):
     assert runs <= rerun and not spared & rerun
 
 
-TRUE_NU = "'nu': 0.45"
-"""In the true law of the scene, and in no other setting of these jobs."""
+TRUE_NU = "'nu': 0.45"  # in the true law of the scene, and in no other setting of these jobs
 
 
 def test_only_jobs_that_make_or_measure_the_truth_are_given_the_true_law(clone):

@@ -103,10 +103,8 @@ def test_placed_files_are_of_one_body_that_moves_as_it_was_filmed(placed):
     assert "IoU" in placed.output
     results = placed.root / "tiny/results/mug_first"
     assert all((results / file).is_file() for file in FILES)
-    placement, start = (
-        read_json(results / "registration.json"),
-        InitialMotion.of(read_json(results / "velocity.json")),
-    )
+    placement = read_json(results / "registration.json")
+    start = InitialMotion.of(read_json(results / "velocity.json"))
     at = np.array([placement["t0_s"] - 3.0])
     (R,), (spin,) = motion.turn(at)
     (centre,), (velocity,) = motion.place(at)

@@ -1,7 +1,5 @@
 """`snakemake --report`: one HTML file that shows figures, tables and captions in a real browser."""
 
-from __future__ import annotations
-
 import ast
 import re
 import shutil

@@ -15,9 +15,7 @@ def rule(name, *patterns):
     """A rule with outputs like ``results/{scene}/metrics.json``."""
     expressions = [re.sub(r"\\\{(\w+)\\\}", r"[^/]+", re.escape(pattern)) for pattern in patterns]
     return SimpleNamespace(
-        name=name,
-        output=patterns,
-        is_producer=lambda path: any(re.fullmatch(e, path) for e in expressions),
+        name=name, output=patterns, is_producer=lambda path: any(re.fullmatch(e, path) for e in expressions)
     )
 
 

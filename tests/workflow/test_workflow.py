@@ -1,7 +1,5 @@
 """The workflow as a user runs it: real Snakemake, every stage, on a setting of two minutes (tiny.yaml)."""
 
-from __future__ import annotations
-
 import json
 import os
 import random
@@ -275,7 +273,7 @@ def test_results_that_a_failed_job_was_to_replace_count_as_out_of_date(failed, f
     after = failed.artifacts()
     changed = {name for name in before if before[name] != after[name]}
     assert {Path(name).name for name in changed} <= {
-        *("adaptor.safetensors", "history.json", "rollout.h5", "metrics.json", "table1.csv", "table1.md"),
+        *("adaptor.safetensors", "history.json", "rollout.h5", "metrics.json", "table1.csv", "table1.md")
     }
     assert f"{SCENE}/neuma/adaptor.safetensors" in changed
     assert failed.plan(*LONGER) == {}

@@ -1,7 +1,5 @@
 """Kernel of the binding of Gaussians to particles."""
 
-from __future__ import annotations
-
 import torch
 
 from neuma_lib.coupling.particle_binding import bind

@@ -1,7 +1,5 @@
 """Kernels of points in closed surfaces, and of nearest neighbours."""
 
-from __future__ import annotations
-
 import torch
 import trimesh
 

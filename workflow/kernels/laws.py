@@ -1,7 +1,5 @@
 """Kernels of the neural and the structured laws, and of all laws without the simulator."""
 
-from __future__ import annotations
-
 from typing import get_args
 
 import torch

@@ -1,7 +1,5 @@
 """Kernels of voxel radiance fields, and of the gradient of analytic laws that are fitted to them."""
 
-from __future__ import annotations
-
 import torch
 
 from neuma_lib.mechanics.analytic import analytic_law

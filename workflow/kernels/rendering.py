@@ -1,7 +1,5 @@
 """Kernels from particles to the image loss."""
 
-from __future__ import annotations
-
 import torch
 
 from neuma_lib.coupling.binding import Binding
@@ -18,10 +16,8 @@ def compile_kernels(device: torch.device) -> None:
     eye = torch.eye(3, device=device).expand(4, 3, 3)
     x, F = x0[None].clone().requires_grad_(), eye[None].clone().requires_grad_()
     means, covars = deform(x0, 0.05**2 * eye, Binding.identity(4, x0), x0, x, F)
-    opacities, sh = (
-        torch.full((4,), 0.5, device=device),
-        torch.zeros(4, 4, 3, device=device, requires_grad=True),
-    )
+    opacities = torch.full((4,), 0.5, device=device)
+    sh = torch.zeros(4, 4, 3, device=device, requires_grad=True)
     camera = torch.eye(4, device=device)[None], torch.tensor([INTRINSICS], device=device)
     scene = (means, covars, opacities, sh, *camera, SIZE, SIZE)
     observed = torch.zeros(1, 1, SIZE, SIZE, 4, dtype=torch.uint8, device=device)

@@ -1,7 +1,5 @@
 """Kernels of the simulator and of the analytic laws."""
 
-from __future__ import annotations
-
 import torch
 
 from neuma_lib.mechanics.analytic import analytic_law

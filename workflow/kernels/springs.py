@@ -1,7 +1,5 @@
 """Kernels of networks of springs."""
 
-from __future__ import annotations
-
 import torch
 
 from neuma_lib.methods.spring_gaus.network import SpringNetwork, Springs

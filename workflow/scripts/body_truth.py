@@ -5,8 +5,7 @@ from scipy.spatial import cKDTree
 from neuma_lib.io.hdf5 import read_arrays, write_arrays
 from workflow.stage import run_script
 
-PARTICLES = {"x": 1, "v": 1, "F": 1, "vol0": 0, "mass": 0}
-"""Arrays of particles, and their axis."""
+PARTICLES = {"x": 1, "v": 1, "F": 1, "vol0": 0, "mass": 0}  # arrays of particles, and their axis
 
 
 def main(inputs, output, params, run) -> None:

@@ -110,12 +110,10 @@ def sight(camera, transforms, timeline, row_time, flight, name) -> Sight:
     first, last = flight["frames"][camera]
     flying = [k for k, frame in enumerate(mattes.frames) if first <= frame["step"] <= last]
     if not flying:
-        raise InputError(
-            f"{name}, {camera}", f"{transforms} has none of the frames {first} to {last} of the flight"
-        )
+        problem = f"{transforms} has none of the frames {first} to {last} of the flight"
+        raise InputError(f"{name}, {camera}", problem)
     frames, pixels = [mattes.frames[k] for k in flying], np.stack([mattes[k] for k in flying])
-    rows = np.array([np.flatnonzero(image[..., 3].any(axis=1)).mean() + 0.5 for image in pixels])
-    times = frame_times(frames, rows, row_time, read_json(timeline)["height"])
+    times = frame_times(frames, pixels, row_time, read_json(timeline)["height"])
     known = flight["offsets_deviation_s"][camera] == 0
     viewmat, K = metric_camera(frames[0], {})
     hidden = read_hidden(transforms)

@@ -38,8 +38,7 @@ def main(inputs, output, params, run) -> None:
         surest = min(registrations, key=lambda each: each["offsets_std_s"][camera])
         gain = np.mean([each["gains"][camera] for each in registrations], axis=0)
         frames = data["frames"]
-        rows = np.array([np.flatnonzero(image[..., 3].any(axis=1)).mean() + 0.5 for image in images])
-        times = frame_times(frames, rows, row_time, read_json(timeline)["height"])
+        times = frame_times(frames, images, row_time, read_json(timeline)["height"])
         times += surest["offsets_s"][camera] - surest["t0_s"]
         chosen = chosen_frames(times, params.duration, params.frames, f"{params.name}, {camera}")
         for k in chosen:

@@ -44,11 +44,7 @@ def main(inputs, output, params, run) -> None:
         bodies.append(body)
         meshes.append(mesh)
         motion = {key: start[key] for key in INITIAL_MOTION}
-        counts = {
-            "particles": len(body.x0),
-            "gaussians": len(body.gaussians),
-            "vertices": len(mesh.vertices),
-        }
+        counts = {"particles": len(body.x0), "gaussians": len(body.gaussians), "vertices": len(mesh.vertices)}
         named = {"name": entry["name"]} if "name" in entry else {}
         starts.append({**named, "scene": entry["scene"], **motion, **counts})
     together, surface = join(bodies), trimesh.util.concatenate(meshes)

@@ -13,10 +13,8 @@ from workflow.stage import run_script
 def main(inputs, output, params, run) -> None:
     path, attributes = read_arrays(inputs.rollout, required=("x", "frames"), only=("x", "frames"))
     mesh = read_mesh(inputs.mesh)
-    vertices, colours = (
-        moving_surface(mesh, path["x"]),
-        vertex_colours(mesh, load_gaussians(inputs.gaussians)),
-    )
+    vertices = moving_surface(mesh, path["x"])
+    colours = vertex_colours(mesh, load_gaussians(inputs.gaussians))
     times = path["frames"] * attributes["dt"]
     around = obstacles(with_obstacles(params.obstacles).get("colliders", ()), times)
     write_blend(output.blend, output.picture, vertices, mesh.faces, times, colours, around)

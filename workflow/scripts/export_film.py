@@ -8,8 +8,7 @@ from neuma_lib.io.files import atomic
 from neuma_lib.io.particles import load_motion, load_reconstruction
 from workflow.stage import run_script
 
-SQUARE = 2
-"""Codecs want sides of a whole number of these [px]."""
+SQUARE = 2  # codecs want sides of a whole number of these [px]
 
 
 def main(inputs, output, params, run) -> None:

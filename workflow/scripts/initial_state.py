@@ -21,10 +21,8 @@ def main(inputs, output, params, run) -> None:
     fit, velocity = read_json(inputs.gaussians), read_json(inputs.velocity)
     x0, _, attributes = load_particles(inputs.particles)
     shape = solid(scene["shape"], iter(listed(inputs.meshes)))
-    mesh, true_mesh = (
-        read_mesh(inputs.mesh),
-        place(shape, scene["size"], scene["height"], scene["center"], rotation=scene["rotation"]),
-    )
+    mesh = read_mesh(inputs.mesh)
+    true_mesh = place(shape, scene["size"], scene["height"], scene["center"], rotation=scene["rotation"])
     axes, spin = np.asarray(velocity["camera_axes"]), np.asarray(scene["spin"])
     truth, _ = read_arrays(inputs.truth, required=("x", "mass"), only=("x", "mass"))
     centre = np.average(truth["x"][0], axis=0, weights=truth["mass"])

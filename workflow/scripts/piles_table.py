@@ -7,10 +7,7 @@ from workflow.stage import run_script
 
 def main(inputs, output, params, run) -> None:
     scenes = [
-        {
-            **scene,
-            **{name: [read_json(file) for file in own] for name, own in files.items()},
-        }
+        {**scene, **{name: [read_json(file) for file in own] for name, own in files.items()}}
         for scene, files in zip(params.scenes, params.files, strict=True)
     ]
     csv, markdown = piles_table(scenes, params.seed, params.development)

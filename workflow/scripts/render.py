@@ -16,8 +16,7 @@ from neuma_lib.splatting.viewpoints import static_views, video_views
 from workflow.inputs import solid
 from workflow.stage import run_script
 
-MIN_VIEWS = 8
-"""Least number of views at t = 0 that see all of the body."""
+MIN_VIEWS = 8  # least number of views at t = 0 that see all of the body
 
 
 def main(inputs, output, params, run) -> None:

@@ -4,8 +4,6 @@ Frame of the board: origin at the lower left corner of the squares, x to the rig
 in metres. (In OpenCV, y points down the page and z into the table.) On the floor, face up, z is up.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -126,7 +124,7 @@ def print_board(path: str | Path, board: BoardConfig, paper: str = "A4") -> None
         canvas.print_pdf(partial, metadata={"CreationDate": None, "Title": "ChArUco board"})
 
 
-def board_page(board: BoardConfig, paper: str) -> Figure:
+def board_page(board: BoardConfig, paper: str) -> "Figure":
     """The page of `print_board`, with axes in millimetres from the lower left corner."""
     if paper not in PAPERS:
         raise InputError("paper", f"unknown size {paper!r}", f"Use one of {', '.join(PAPERS)}")
@@ -249,11 +247,8 @@ def board_pose(detection: Detection, board: BoardConfig, lens: Lens, where: str)
             best = pose, error
     if best is None or not best[1] < _MAX_PIXELS:
         error = f" (error {best[1]:.1f} px, limit {_MAX_PIXELS:g} px)" if best else ""
-        raise InputError(
-            where,
-            f"the corners do not fit a flat board seen from above{error}",
-            "Check board.squares, the lens, and that the print lies flat",
-        )
+        problem = f"the corners do not fit a flat board seen from above{error}"
+        raise InputError(where, problem, "Check board.squares, the lens, and that the print lies flat")
     return best
 
 

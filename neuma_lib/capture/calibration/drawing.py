@@ -1,7 +1,5 @@
 """Draw reconstructed cameras and points, and the floor in the photographs."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

@@ -5,8 +5,6 @@ pixels are shifted by half a pixel where they are passed to OpenCV. Cameras look
 (COLMAP, OpenCV). `transforms.json` has OpenGL axes (`neuma_lib.io.images`).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -55,7 +53,7 @@ class Lens:
         points = np.asarray(pixels, np.float64).reshape(-1, 1, 2)
         return cv2.undistortPointsIter(points, self.K, self.distortion, None, None, _INVERSION).reshape(-1, 2)
 
-    def pinhole(self) -> Lens:
+    def pinhole(self) -> "Lens":
         """The lens of the same size without distortion whose picture lies completely within this one's."""
         if not self.distortion.any():
             return self
@@ -72,9 +70,8 @@ class Lens:
         """
         if image.shape[:2] != (self.height, self.width):
             height, width = image.shape[:2]
-            raise InputError(
-                "image", f"a picture of {width}x{height} does not fit the lens of {self.width}x{self.height}"
-            )
+            problem = f"a picture of {width}x{height} does not fit the lens of {self.width}x{self.height}"
+            raise InputError("image", problem)
         if not self.distortion.any():
             return image
         cv2 = opencv()
@@ -89,7 +86,7 @@ class Lens:
             self._opencv_K(), self.distortion, None, target, size, cv2.CV_32FC1
         )
 
-    def resized(self, longest: int) -> Lens:
+    def resized(self, longest: int) -> "Lens":
         """The lens for pictures reduced to a longer side of at most ``longest`` pixels."""
         factor = min(1.0, longest / max(self.width, self.height))
         width, height = max(1, round(factor * self.width)), max(1, round(factor * self.height))

@@ -1,7 +1,5 @@
 """Pose of a camera from one square marker."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from neuma_lib.capture.tools import opencv

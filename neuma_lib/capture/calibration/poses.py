@@ -1,7 +1,5 @@
 """Camera poses: from structure from motion on the photographs, from the board alone, or from a file."""
 
-from __future__ import annotations
-
 import copy
 import shutil
 from collections.abc import Collection, Mapping, Sequence
@@ -72,7 +70,7 @@ class Poses:
                 row[self.sightings[self.names.index(name)]] = True
         return seen
 
-    def moved(self, by: Similarity) -> Poses:
+    def moved(self, by: Similarity) -> "Poses":
         """The poses after a similarity of the world."""
         return replace(self, viewmats=by.move_cameras(self.viewmats), points=by.apply(self.points))
 
@@ -470,11 +468,8 @@ def poses_from_board(
             poses.append(pose)
             errors.append(error)
     if not names:
-        raise InputError(
-            "board",
-            f"none of {len(detections)} pictures shows the board",
-            "Lay it uncovered next to the object",
-        )
+        problem = f"none of {len(detections)} pictures shows the board"
+        raise InputError("board", problem, "Lay it uncovered next to the object")
     placed = Poses(
         tuple(names),
         tuple(lenses[group_of(name)] for name in names),
@@ -512,9 +507,8 @@ def given_poses(path: str | Path, pictures: Mapping[str, Path]) -> Poses:
         size = dict(zip("wh", picture_size(file)))
         lens = read_lens({**_centred(frame, **size), **size}, f"{path}: {name}")
         if (frame.get("w", lens.width), frame.get("h", lens.height)) != (lens.width, lens.height):
-            raise InputError(
-                f"{path}: {name}", f"w, h do not match the picture of {lens.width}x{lens.height} pixels"
-            )
+            problem = f"w, h do not match the picture of {lens.width}x{lens.height} pixels"
+            raise InputError(f"{path}: {name}", problem)
         names.append(name)
         lenses.append(lens)
         viewmats.append(np.linalg.inv(np.array(frame["transform_matrix"], np.float64) @ OPENGL_TO_OPENCV))

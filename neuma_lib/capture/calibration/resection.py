@@ -7,8 +7,6 @@ points' covariances: a maximum a posteriori estimate with marginalised points (T
 prior on the principal point from phones.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """The room: poses in metres, y up, the floor at y = 0, from the board, a known length, or given poses."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -42,14 +40,10 @@ from neuma_lib.project.capture_folder import PHOTOGRAPHS
 
 FLOOR_TOLERANCE = 0.005
 """Distance of near points from the floor, relative to the distance from the cameras to the points."""
-_SUPPORT, _MIN_SUPPORT = (
-    4.0,
-    40,
-)  # distance from a selected object, in half sizes, and number of points on its floor
-_MARK = (
-    1.5,
-    0.001,
-)  # standard deviation of a marked point [px], and as share of the longer side of the photograph
+# distance from a selected object, in half sizes, and number of points on its floor
+_SUPPORT, _MIN_SUPPORT = 4.0, 40
+# standard deviation of a marked point [px], and as share of the longer side of the photograph
+_MARK = (1.5, 0.001)
 BOX_MIDDLE = (0.5, 0.0, 0.5)  # position of the room's origin, on the floor, in the simulation box [m]
 
 
@@ -204,11 +198,8 @@ def _metres_per_unit(
             lenses.append(lens)
     required = min(2, len(length.ends))
     if len(views) < required:
-        raise InputError(
-            "length.ends",
-            f"{len(views)} of the marked photographs were registered, at least {required} must be",
-            "Mark the points in other photographs",
-        )
+        problem = f"{len(views)} of the marked photographs were registered, at least {required} must be"
+        raise InputError("length.ends", problem, "Mark the points in other photographs")
 
     def metres_per_unit(shift: np.ndarray) -> float:
         seen = [lens.directions(mark + by) for lens, mark, by in zip(lenses, marks, shift)]

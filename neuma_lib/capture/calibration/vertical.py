@@ -5,8 +5,6 @@ a board may lean, and the orientation sensor of a phone that is held flat report
 wrong turns the whole simulation, so the cues are compared before anything else uses the direction.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -32,7 +30,7 @@ class Cue:
     up: np.ndarray  # unit vector (3,)
     deviation: float = 0.0  # standard deviation about the worst axis [degrees]
 
-    def angle(self, other: Cue) -> float:
+    def angle(self, other: "Cue") -> float:
         """Angle to another cue [degrees]."""
         return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(self.up, other.up)), self.up @ other.up)))
 

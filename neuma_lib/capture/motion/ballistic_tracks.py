@@ -8,8 +8,6 @@ candidates lie on it.
 Positions are (x, y) [px], pixel centres at +0.5.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

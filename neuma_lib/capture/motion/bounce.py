@@ -8,8 +8,6 @@ where I is the integral of (1 - x^(5/2))^(-1/2) from 0 to 1. With losses, v lies
 uncertainty. Heights are -y of the picture [px].
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -20,8 +18,7 @@ from neuma_lib.capture.masks.regions import centroid, radius_of, whole
 
 HALF_CONTACT = 0.4 * float(beta(0.4, 0.5))
 """Time until the largest flattening, of flattening / speed: the integral I."""
-MIN_RADIUS = 5.0
-"""Radius of a silhouette from which its lowest point is measured [px]."""
+MIN_RADIUS = 5.0  # radius of a silhouette from which its lowest point is measured [px]
 _SAMPLES = 4000
 _BAND = (2.5, 50.0, 97.5)  # percentiles
 _MIDDLE = 0.4  # half the width of the middle part of a silhouette, in radii

@@ -1,7 +1,5 @@
 """Time and place at which a falling object touches the floor, from its masks."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
@@ -21,12 +19,8 @@ def place_on_floor(mask: np.ndarray, viewmat: np.ndarray, K: np.ndarray) -> tupl
         viewmat: world to camera, OpenCV axes, (4, 4).
         K: intrinsics [px], pixel centres at +0.5, (3, 3).
     """
-    R = viewmat[:3, :3]
-    eye = -R.T @ viewmat[:3, 3]
-    rows, columns = np.nonzero(mask)
-    pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))])
-    rays = R.T @ np.linalg.solve(K, pixels)
-    middle = R.T @ np.linalg.solve(K, np.append(centroid(mask), 1.0))
+    eye, rays = _rays(mask, viewmat, K)
+    middle = viewmat[:3, :3].T @ np.linalg.solve(K, np.append(centroid(mask), 1.0))
     if eye[1] <= 0 or rays[1].min() >= 0 or middle[1] >= 0:
         return None
     down = rays[:, rays[1] < 0]
@@ -52,17 +46,20 @@ def lowest_points(
         viewmat: world to camera, OpenCV axes, (4, 4).
         K: intrinsics [px], pixel centres at +0.5, (3, 3).
     """
-    R = viewmat[:3, :3]
-    eye = -R.T @ viewmat[:3, 3]
     heights = []
     for mask, centre in zip(masks, centres):
-        rows, columns = np.nonzero(mask)
-        pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))])
-        rays = R.T @ np.linalg.solve(K, pixels)
+        eye, rays = _rays(mask, viewmat, K)
         towards = (centre - eye) * (1.0, 0.0, 1.0)
         reach = towards @ towards / np.maximum(towards @ rays, 1e-9)
         heights.append((eye[1] + reach * rays[1]).min())
     return np.array(heights)
+
+
+def _rays(mask: np.ndarray, viewmat: np.ndarray, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Centre of a camera (3,) and directions (3, P) in the world of the rays through the pixels of a mask."""
+    rows, columns = np.nonzero(mask)
+    pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))])
+    return -viewmat[:3, :3].T @ viewmat[:3, 3], viewmat[:3, :3].T @ np.linalg.solve(K, pixels)
 
 
 def contact_time(times: Sequence[np.ndarray], heights: Sequence[np.ndarray]) -> float:

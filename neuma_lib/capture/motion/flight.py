@@ -1,7 +1,5 @@
 """Free flight of one take, from the masks of all its cameras: time offsets, gravity, velocity and spin."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Fit the free flight of an object's centre, x(t) = x0 + v0 t + a t^2 / 2 between release and contact."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -245,11 +243,8 @@ def fit_flight(
             fall = fit_free_fall(chosen, plane, fall.offsets, fixed)
     limit = min(max(_MAX_RMS * _height(track), MAX_RMS_OF_RADIUS * track.radius) for track in tracks)
     if fall.rms > limit:
-        raise InputError(
-            ", ".join(track.name for track in tracks),
-            f"no free flight fits the tracks: the error is {fall.rms:.1f} px, the limit {limit:.1f} px",
-            CHECK_VIDEOS,
-        )
+        problem = f"no free flight fits the tracks: the error is {fall.rms:.1f} px, the limit {limit:.1f} px"
+        raise InputError(", ".join(track.name for track in tracks), problem, CHECK_VIDEOS)
     return fall, [slice(*ends) for ends in kept]
 
 

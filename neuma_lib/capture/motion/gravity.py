@@ -4,8 +4,6 @@ The centre of mass of any object accelerates at 9.81 m/s^2 straight down, if the
 the floor are right. A relative error e of the times appears as 2 e.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

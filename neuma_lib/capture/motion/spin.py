@@ -5,8 +5,6 @@ of a compact object is nearly constant over a few tenths of a second. The depths
 on a sphere with the area of the mask and are fitted together with the angular velocity.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -147,19 +145,15 @@ def fit_spin(paths: Sequence[Path], tracks: Sequence[Track], fall: FreeFall) -> 
 
     def jacobian(u: np.ndarray) -> np.ndarray:
         # A depth only affects the rows of its path, so one finite difference covers all depths.
+        def slope(unknowns: int | slice) -> np.ndarray:
+            step = np.zeros(len(u))
+            step[unknowns] = 1e-5
+            return (residuals(u + step) - residuals(u - step)) / 2e-5
+
         J = np.zeros((2 * len(path) + len(paths), 3 + len(paths)))
-        step = 1e-5
         for k in range(3):
-            moved = u.copy()
-            moved[k] += step
-            back = u.copy()
-            back[k] -= step
-            J[:, k] = (residuals(moved) - residuals(back)) / (2 * step)
-        moved, back = u.copy(), u.copy()
-        moved[3:] += step
-        back[3:] -= step
-        change = (residuals(moved) - residuals(back)) / (2 * step)
-        rows = np.arange(2 * len(path))
+            J[:, k] = slope(k)
+        change, rows = slope(slice(3, None)), np.arange(2 * len(path))
         J[rows, 3 + np.repeat(path, 2)] = change[: 2 * len(path)]
         J[2 * len(path) + np.arange(len(paths)), 3 + np.arange(len(paths))] = 1 / _DEPTH_SPREAD
         return J

@@ -1,7 +1,5 @@
 """Frames of a take in simulation time: convert the mattes of each camera to frames for training."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -16,16 +14,17 @@ _MIN_FRAMES = 8  # frames after the start required of each camera: fewer show no
 
 
 def frame_times(
-    frames: Sequence[Mapping[str, Any]], rows: np.ndarray, row_time: float, sensor_rows: int
+    frames: Sequence[Mapping[str, Any]], mattes: np.ndarray, row_time: float, sensor_rows: int
 ) -> np.ndarray:
     """Exposure times of the object in each frame, on the camera's clock, (T,) [s].
 
     Args:
         frames: entries with ``time`` [s] and ``h`` [px].
-        rows: y of the object's centre [px], (T,).
+        mattes: RGBA pictures of the object, (T, H, W, 4).
         row_time: of a rolling shutter [s].
         sensor_rows: rows of the recorded frames.
     """
+    rows = np.array([np.flatnonzero(matte[..., 3].any(axis=1)).mean() + 0.5 for matte in mattes])
     times = np.array([frame["time"] for frame in frames])
     return row_times(times, rows, row_time, frames[0]["h"], sensor_rows)
 

@@ -3,8 +3,6 @@
 An offset is added to the second camera's times to convert them to the first camera's clock.
 """
 
-from __future__ import annotations
-
 import subprocess
 from dataclasses import dataclass
 from pathlib import Path
@@ -58,9 +56,8 @@ def read_sound(path: str | Path) -> np.ndarray | None:
         raise InputError(path, f"its sound is longer than {MAX_SOUND} s", "Cut the video to the take")
     message = errors.decode(errors="replace")
     if process.returncode and "does not contain any stream" not in message:
-        raise InputError(
-            path, f"cannot be read as a video ({one_line(message)})", "Copy it from the camera again"
-        )
+        problem = f"cannot be read as a video ({one_line(message)})"
+        raise InputError(path, problem, "Copy it from the camera again")
     return np.frombuffer(sound, np.float32) if sound else None
 
 
@@ -156,20 +153,14 @@ def choose_offset(sound: Offset | None, motion: Offset | None, name: str) -> tup
     """The offset with the smaller standard deviation, and a line of text. Raises InputError if both disagree."""
     offsets = [o for o in (sound, motion) if o is not None]
     if not offsets:
-        raise InputError(
-            name,
-            "neither sound nor motion determines the time offset between the cameras",
-            "Clap in view of all cameras while they film, or set the offset",
-        )
+        problem = "neither sound nor motion determines the time offset between the cameras"
+        raise InputError(name, problem, "Clap in view of all cameras while they film, or set the offset")
     listed = ", ".join(f"{o.source} {1e3 * o.seconds:.1f} +- {1e3 * o.deviation:.1f} ms" for o in offsets)
     if len(offsets) == 2:
         difference = abs(sound.seconds - motion.seconds)
         if difference > 4 * np.hypot(sound.deviation, motion.deviation):
-            raise InputError(
-                name,
-                f"the time offsets from sound and motion disagree ({listed})",
-                "Set the offset, or check that the videos show the same fall",
-            )
+            problem = f"the time offsets from sound and motion disagree ({listed})"
+            raise InputError(name, problem, "Set the offset, or check that the videos show the same fall")
     best = min(offsets, key=lambda o: o.deviation)
     return best, f"{name}: time between the cameras by {best.source} ({listed})"
 

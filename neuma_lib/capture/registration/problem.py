@@ -1,7 +1,5 @@
 """Least-squares problem of the registration: images of a rigid flight as a function of pose, motion and times."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

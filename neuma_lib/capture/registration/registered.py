@@ -1,7 +1,5 @@
 """Result of the registration of a photographed object to its video: pose, motion, uncertainty and ambiguity."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

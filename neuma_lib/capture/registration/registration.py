@@ -11,8 +11,6 @@ If another pose explains the video nearly as well, the pose is ambiguous, which 
 without texture has no defined rotation, and a symmetric bottle none about its axis.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -93,7 +91,7 @@ class Parabola:
     gravity: np.ndarray  # [m/s^2], (3,)
     spin: np.ndarray | None = None  # [rad/s], (3,). None if unknown.
 
-    def at(self, time: float) -> Parabola:
+    def at(self, time: float) -> "Parabola":
         """The same flight at another reference time."""
         t = time - self.time
         place = self.place + self.velocity * t + self.gravity * t**2 / 2

@@ -1,7 +1,5 @@
 """Free flight of a rigid body, with a parabola of its centre and constant angular momentum."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,10 +52,8 @@ def rotate(
     def slope(R):
         return np.cross(rate(R)[:, :, None], R, axis=1)
 
-    rotations_at, speeds = (
-        np.empty((len(rotations), len(times), 3, 3)),
-        np.empty((len(rotations), len(times), 3)),
-    )
+    rotations_at = np.empty((len(rotations), len(times), 3, 3))
+    speeds = np.empty((len(rotations), len(times), 3))
     for side in (1, -1):
         R, now = rotations, 0.0
         for i in np.argsort(side * times, kind="stable"):

@@ -8,8 +8,6 @@ in which the body has rotated. A gain per channel of a camera, and a grey factor
 body, are therefore fitted in closed form, and colours that agree poorly have lower weights (`weights`).
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -56,7 +54,7 @@ class Sight:
         """Times by the clock of the first camera [s], (T,)."""
         return self.times + self.offset
 
-    def select(self, keep: Sequence[int]) -> Sight:
+    def select(self, keep: Sequence[int]) -> "Sight":
         """The frames with the given indices."""
         keep = list(keep)
         hidden = None if self.hidden is None else self.hidden[keep]
@@ -84,7 +82,7 @@ class Body:
     radius: float  # 98th percentile of the distances of means from the centre [m]
 
     @classmethod
-    def about(cls, gaussians: Gaussians, centre: np.ndarray) -> Body:
+    def about(cls, gaussians: Gaussians, centre: np.ndarray) -> "Body":
         """Gaussians relative to a centre (3,) [m]."""
         means = gaussians.means - torch.as_tensor(centre).to(gaussians.means)
         radius = float(torch.quantile(means.norm(dim=1), 0.98))

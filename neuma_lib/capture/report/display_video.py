@@ -1,7 +1,5 @@
 """Video of a take for display in the report: original frames, mattes and background at reduced size."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any

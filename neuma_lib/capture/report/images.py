@@ -6,8 +6,6 @@ prediction composited over the empty scene. The common background makes their PS
 they only rank methods on one video. Shadows and reflections of the object are missing in the prediction.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -64,9 +62,8 @@ def captured_metrics(
     """
     if not (colours.shape == picture.shape == empty.shape == matte[..., :3].shape):
         shapes = [tuple(each.shape) for each in (colours, picture, empty, matte)]
-        raise InputError(
-            "image measures", f"prediction, frame, empty scene and matte differ in size: {shapes}"
-        )
+        problem = f"prediction, frame, empty scene and matte differ in size: {shapes}"
+        raise InputError("image measures", problem)
     mask = matte[..., 3]
     true = composited(matte[..., :3] * mask[..., None], mask, 1.0)
     metrics = image_metrics(composited(colours, alpha, 1.0), alpha, true, mask, networks, margin)

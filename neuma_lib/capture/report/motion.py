@@ -1,7 +1,5 @@
 """Statistics of a predicted motion that is compared with a video."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Checks of a capture with their expected values, and pages that list them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 

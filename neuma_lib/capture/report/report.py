@@ -1,7 +1,5 @@
 """The report of a capture: a self-contained HTML file with its pictures and videos."""
 
-from __future__ import annotations
-
 import base64
 import math
 from collections.abc import Mapping, Sequence

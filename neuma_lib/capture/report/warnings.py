@@ -1,7 +1,5 @@
 """Warnings about a law learned from a capture: failed checks, and what the videos do not determine."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

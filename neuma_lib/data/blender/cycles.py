@@ -1,7 +1,5 @@
 """The Blender scene. Imports bpy and is used through `neuma_lib.data.blender.scene`."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -184,7 +182,7 @@ class Obstacles:
             each.is_holdout = transparent
 
 
-def cut_out_others(bodies: Sequence[Body], shown: int | None) -> None:
+def cut_out_others(bodies: "Sequence[Body]", shown: int | None) -> None:
     """Make all bodies but one transparent, which hide it nevertheless, or none."""
     for k, body in enumerate(bodies):
         body.object.is_holdout = shown is not None and k != shown

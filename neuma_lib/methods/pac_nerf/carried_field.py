@@ -1,7 +1,5 @@
 """A radiance field represented by particles in a simulation, and its images (PAC-NeRF, Li et al. 2023, Sec. 3.2)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -52,22 +50,14 @@ class CarriedField:
 
     @classmethod
     def load(
-        cls,
-        path: str | Path,
-        own: Mapping[str, Any],
-        density: Density,
-        device: torch.device | str = "cpu",
-    ) -> CarriedField:
+        cls, path: str | Path, own: Mapping[str, Any], density: Density, device: torch.device | str = "cpu"
+    ) -> "CarriedField":
         """The field of a file with the options ``own`` of the method: ``spacing``, ``min_opacity`` and ``settings`` (a
         `PacNerfConfig` as plain values).
         """
         field, _ = load_field(path)
         return cls(
-            field.to(device),
-            own["spacing"],
-            own["min_opacity"],
-            PacNerfConfig(**own["settings"]),
-            density,
+            field.to(device), own["spacing"], own["min_opacity"], PacNerfConfig(**own["settings"]), density
         )
 
     def state(
@@ -83,7 +73,7 @@ class CarriedField:
         """Positions of the rendered particles (T, N, 3) [m] for those of the simulated ones (T, A, 3)."""
         return self._follow(x)[0]
 
-    def particle_gs(self, cameras: Cameras, background: Sequence[float] = WHITE) -> FieldRenderer:
+    def particle_gs(self, cameras: Cameras, background: Sequence[float] = WHITE) -> "FieldRenderer":
         """The renderer of this body for the given cameras, see `Reconstruction.particle_gs`."""
         return FieldRenderer(self, cameras, background)
 

@@ -14,6 +14,7 @@ from torch import Tensor
 from neuma_lib.errors import InputError
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.catalogue import lame
+from neuma_lib.mechanics.combinations import constants_of
 from neuma_lib.mechanics.law import Law
 from neuma_lib.methods.pac_nerf.options import MODULI, PacFamilyConfig, PacNerfConfig
 
@@ -101,9 +102,8 @@ def _to_stored(name: str, value: float) -> float:
         return value
     if name == "nu":
         if not abs(value) < MAX_POISSON:
-            raise InputError(
-                "pac_nerf.families.nu", f"the size of {value:g} must be below {MAX_POISSON} to be fitted"
-            )
+            problem = f"the size of {value:g} must be below {MAX_POISSON} to be fitted"
+            raise InputError("pac_nerf.families.nu", problem)
         return MAX_POISSON * math.atanh(value / MAX_POISSON)
     if not value > 0:
         raise InputError(f"pac_nerf.families.{name}", f"{value:g} must be positive to be fitted")
@@ -132,22 +132,16 @@ def choose_family(
     """
     families, name = settings.families, settings.family
     if prior is None and (name is None or settings.guesses == "prior"):
-        raise InputError(
-            "pac_nerf.family",
-            "it cannot be selected because the scene's prior is a file, not an analytic law",
-            "Set pac_nerf.family, and pac_nerf.guesses to stock",
-        )
+        problem = "it cannot be selected because the scene's prior is a file, not an analytic law"
+        raise InputError("pac_nerf.family", problem, "Set pac_nerf.family, and pac_nerf.guesses to stock")
     if name is None:
         plasticity = prior["plasticity"]["name"]
         matching = [key for key, family in families.items() if family.plasticity.name == plasticity]
         if not matching:
-            raise InputError(
-                "pac_nerf.families",
-                f"none has the return map {plasticity} of the scene's prior",
-                "Add one, or set pac_nerf.family",
-            )
+            problem = f"none has the return map {plasticity} of the scene's prior"
+            raise InputError("pac_nerf.families", problem, "Add one, or set pac_nerf.family")
         name = matching[0]
     if name not in families:
         raise InputError("pac_nerf.family", f"{name!r} must be one of {', '.join(families)}")
-    known = {key: value for part in (prior or {}).values() for key, value in part.items() if key != "name"}
-    return name, FamilyConstants(families[name], known if settings.guesses == "prior" else None)
+    known = constants_of(prior or {}) if settings.guesses == "prior" else None
+    return name, FamilyConstants(families[name], known)

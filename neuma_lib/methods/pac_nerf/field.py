@@ -4,8 +4,6 @@ The raw density of a particle determines its appearance. Its opacity over one in
 that the diffuse shell of a field is light and soft.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -94,7 +92,7 @@ class RadianceField(nn.Module):
         opacity: Opacity,
         state: Mapping[str, Tensor],
         network: ColourNetwork | None = None,
-    ) -> RadianceField:
+    ) -> "RadianceField":
         """Inverse of ``state_dict``. Raises ValueError, before nodes are allocated, if these are not the lattice's."""
         if tuple(state["density"].shape) != (*lattice.nodes, 1):
             raise ValueError(f"densities of shape {tuple(state['density'].shape)} on {lattice.nodes} nodes")
@@ -114,7 +112,7 @@ class RadianceField(nn.Module):
         return near >= share * alphas.max()
 
     @torch.no_grad()
-    def halved(self) -> RadianceField:
+    def halved(self) -> "RadianceField":
         """The occupied part of the field on a lattice of half the voxel size, with the same network."""
         nodes, lattice = self.occupied(OCCUPIED).nonzero(), self.lattice
         low = nodes.amin(0).clamp(max=torch.tensor(lattice.nodes, device=nodes.device) - 2)

@@ -75,9 +75,8 @@ def fit_radiance_field(
     for iteration in range(start, settings.iterations):
         loss = fit.step(iteration)
         if not math.isfinite(loss):
-            raise NonFiniteError(
-                "radiance field", f"the loss is {loss} in iteration {iteration}. Lower radiance.rate_density"
-            )
+            problem = f"the loss is {loss} in iteration {iteration}. Lower radiance.rate_density"
+            raise NonFiniteError("radiance field", problem)
         if progress is not None:
             progress(iteration, loss)
         if checkpoint and (iteration + 1) % settings.checkpoint_every == 0:
@@ -214,7 +213,6 @@ def _check(images: Tensor, cameras: Cameras, held_out: int) -> None:
     if tuple(images.shape) != expected:
         raise InputError("images", f"shape {tuple(images.shape)} must be {expected}, as for the cameras")
     if len(cameras) <= max(1, held_out // 2):
-        raise InputError(
-            "radiance.held_out", f"{held_out} leaves no held-out view of {len(cameras)}", "Lower it"
-        )
+        problem = f"{held_out} leaves no held-out view of {len(cameras)}"
+        raise InputError("radiance.held_out", problem, "Lower it")
     check_masks(images[..., 3])

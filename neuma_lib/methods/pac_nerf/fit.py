@@ -285,9 +285,8 @@ class _Fit:
         state = self.body.state(velocity)
         law = self.constants.law(model.dt, state.x.device)
         if (number := model.courant(law, float(state.density.min()))) > COURANT_LIMIT:
-            raise NonFiniteError(
-                "pac_nerf", f"the Courant number of {self.constants.specification()} is {number:.2g}"
-            )
+            problem = f"the Courant number of {self.constants.specification()} is {number:.2g}"
+            raise NonFiniteError("pac_nerf", problem)
         return self.body.positions(rollout(model, law, state, steps=frames[-1], frames=frames).x)
 
     def _loss(self, chosen: Sequence[int], halvings: int) -> float:
@@ -312,9 +311,8 @@ class _Fit:
 
     def _finite(self, loss: float, of: Iterable[Tensor]) -> float:
         if not (math.isfinite(loss) and all(bool(p.grad.isfinite().all()) for p in of)):
-            raise NonFiniteError(
-                "pac_nerf", f"the loss or its gradient is not finite at step {self.iteration}"
-            )
+            problem = f"the loss or its gradient is not finite at step {self.iteration}"
+            raise NonFiniteError("pac_nerf", problem)
         return loss
 
     def state_dict(self) -> dict[str, Any]:

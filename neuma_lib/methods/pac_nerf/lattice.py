@@ -1,7 +1,5 @@
 """Values on a regular lattice of nodes: trilinear interpolation at points, and means of values of particles."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -26,13 +24,11 @@ class Lattice:
 
     def __post_init__(self):
         if self.voxel <= 0 or min(self.nodes) < 2:
-            raise InputError(
-                "lattice",
-                f"nodes = {self.nodes} must be at least 2 per axis and voxel = {self.voxel} m positive",
-            )
+            problem = f"nodes = {self.nodes} must be at least 2 per axis and voxel = {self.voxel} m positive"
+            raise InputError("lattice", problem)
 
     @classmethod
-    def spanning(cls, low: Tensor, high: Tensor, voxel: float) -> Lattice:
+    def spanning(cls, low: Tensor, high: Tensor, voxel: float) -> "Lattice":
         """The smallest lattice with nodes at multiples of the voxel that contains two corners (3,) [m]."""
         first = torch.floor(low.detach().double() / voxel).long().tolist()
         last = torch.floor(high.detach().double() / voxel).long().tolist()

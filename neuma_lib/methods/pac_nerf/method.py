@@ -116,11 +116,7 @@ class PacNerf(Method):
         curves = asdict(fit.history)
         del curves["seconds"]  # equal settings give equal files
         centre = body.mass @ body.moving.x / body.mass.sum()
-        start = {
-            "v0": fit.velocity.tolist(),
-            "angular_velocity": [0.0, 0.0, 0.0],
-            "centre": centre.tolist(),
-        }
+        start = {"v0": fit.velocity.tolist(), "angular_velocity": [0.0, 0.0, 0.0], "centre": centre.tolist()}
         about = {"family": family, "law": constants.specification(), "guess": guess}
         about |= {"guesses": settings.guesses, "fitted": constants.fitted}
         write_json(run.product, {**about, "start": start})

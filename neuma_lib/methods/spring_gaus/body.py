@@ -1,7 +1,5 @@
 """A body whose particles follow the anchors of a network of springs."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -24,19 +22,18 @@ class SpringBody:
     @classmethod
     def of(
         cls, x0: Tensor, anchors: int, neighbours: int, hard: int, exponent: float, carriers: int
-    ) -> SpringBody:
+    ) -> "SpringBody":
         """Choose anchors by farthest-point sampling of the particles x0 (N, 3) [m], and connect them by springs."""
         index = farthest_points(x0, anchors).to(x0.device)
         network = SpringNetwork.of(x0[index], neighbours, hard, exponent)
         return cls(index, network, Interpolation(x0, network.anchors, carriers))
 
     @classmethod
-    def with_network(cls, x0: Tensor, index: Tensor, network: SpringNetwork, carriers: int) -> SpringBody:
+    def with_network(cls, x0: Tensor, index: Tensor, network: SpringNetwork, carriers: int) -> "SpringBody":
         """The body of an existing network. Raises InputError if its anchors are not the particles ``index``."""
         if index.max() >= len(x0) or not torch.equal(x0[index], network.anchors):
-            raise InputError(
-                "springs", "the anchors are not particles of the body", "Run the rule fit_spring_gaus again"
-            )
+            problem = "the anchors are not particles of the body"
+            raise InputError("springs", problem, "Run the rule fit_spring_gaus again")
         return cls(index, network, Interpolation(x0, network.anchors, carriers))
 
     def start(self, state: State) -> tuple[Tensor, Tensor]:

@@ -63,9 +63,8 @@ class SpringNetwork:
         others[others.all(1), -1] = False
         shape = (len(points), count)
         if not (distance[others] > 0).all():
-            raise InputError(
-                "springs.anchors", "two anchors have the same position", "Sample the particles again"
-            )
+            problem = "two anchors have the same position"
+            raise InputError("springs.anchors", problem, "Sample the particles again")
         rest, index = (
             torch.as_tensor(a[others].reshape(shape)).to(anchors.device) for a in (distance, index)
         )

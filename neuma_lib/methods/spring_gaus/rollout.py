@@ -1,7 +1,5 @@
 """Differentiable simulation of a network of springs in the box, with adaptive substeps."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -33,16 +31,14 @@ class SpringModel:
     substeps: int = 1  # minimum number of substeps per time step
 
     @classmethod
-    def of(cls, model: MPM, substeps: int = 1) -> SpringModel:
+    def of(cls, model: MPM, substeps: int = 1) -> "SpringModel":
         """Gravity, time step and box of an MPM model, with planes where bodies come to rest in it."""
         if model.colliders or model.clamps:
-            raise InputError(
-                "spring_gaus", "springs touch only the faces of the cube", "Leave this method out"
-            )
+            problem = "springs touch only the faces of the cube"
+            raise InputError("spring_gaus", problem, "Leave this method out")
         low, high = model.free_range
-        half = (
-            0.5 * model.dx if model.wall_nodes else 0.0
-        )  # contact of nodes starts half a cell before the wall
+        # contact of nodes starts half a cell before the wall
+        half = 0.5 * model.dx if model.wall_nodes else 0.0
         return cls(model.dt, model.gravity, low - half, high + half, substeps)
 
 
