@@ -359,6 +359,7 @@ class Method(ABC):
 
 
 BODY = {"particles": "particles.h5", "binding": "binding.h5", "gaussians": "gaussians.ply"}
+"""Files of a reconstructed body: the particles that are simulated, the Gaussians, and what binds them."""
 
 
 def body_of_each_video(case: Case) -> Files:

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 from neuma_lib.config.obstacles import is_mesh_file
 from neuma_lib.config.variants import replicate_folder
 from neuma_lib.io.files import listed
+from neuma_lib.methods.base import BODY
 from neuma_lib.project import paths
 from neuma_lib.project.settings import NO_TRUTH
 from workflow.inputs import image_list
@@ -53,10 +54,6 @@ def by_subject(scene, experiment):
         return (experiment if of_experiment(wildcards) else scene)(subject(wildcards))
 
     return choose
-
-
-# Files of a reconstructed body: the particles that are simulated, the Gaussians, and what binds them.
-BODY = {"particles": "particles.h5", "binding": "binding.h5", "gaussians": "gaussians.ply"}
 
 
 def body_files():

@@ -1,10 +1,9 @@
 """Spring-Gaus (Zhong et al., ECCV 2024): a network of springs in the body, without a material law."""
 
 from neuma_lib.config.training import TrainingConfig
-from neuma_lib.methods.base import Case, Files, Method, Preset
+from neuma_lib.methods.base import BODY, Case, Files, Method, Preset
 from neuma_lib.methods.spring_gaus.options import SpringsConfig
 
-BODY = {"particles": "particles.h5", "binding": "binding.h5", "gaussians": "gaussians.ply"}
 OF_NETWORK = ("anchors", "neighbours", "hard_springs", "exponent", "carriers")
 """Options that a network of springs is built with."""
 
