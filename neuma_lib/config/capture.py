@@ -7,6 +7,8 @@ from pydantic import AfterValidator, Field, model_validator
 
 from neuma_lib.config.base import Section, Seed, internal
 from neuma_lib.config.board import BoardConfig
+from neuma_lib.config.scenes import MAX_BODIES
+from neuma_lib.config.variants import NAME
 
 
 def _inside(name: str) -> str:
@@ -74,6 +76,19 @@ class ThrowConfig(Section):
     folder: Inside = Field(description="folder with a video of each camera, `<camera>.mp4`")
 
 
+class LabelledBodyConfig(Section):
+    """One of several bodies of a capture, by its label in the masks."""
+
+    label: Annotated[int, Field(ge=1, le=255)] | Annotated[str, Field(pattern="^#[0-9a-fA-F]{6}$")] = Field(
+        description="its pixels in all masks: grey value or palette index from 1, or colour as '#ff0000'"
+    )
+    capture: str | None = Field(
+        None,
+        description="another capture, with photographs of this body alone; null: the photographs of this one show it",
+    )
+    density: float = Field(1000.0, gt=0, description="its mass density [kg/m^3]")
+
+
 class CaptureConfig(Section):
     """Settings of one capture, `captures/<name>/capture.yaml`: what photographs and videos do not contain."""
 
@@ -113,6 +128,10 @@ class CaptureConfig(Section):
         description="photograph -> (x0, y0, x1, y1) of a tight box around the whole object, or (x, y) of a point in "
         "its middle [px], from the upper left corner of the displayed picture; needed if other objects are around; "
         "one is enough",
+    )
+    bodies: dict[str, LabelledBodyConfig] = Field(
+        {},
+        description="two to five bodies by name that touch each other in the videos, labelled in own masks",
     )
     center: Pixel | None = Field(
         None,
@@ -158,6 +177,18 @@ class CaptureConfig(Section):
         if self.center is not None and (self.board is None or self.poses not in ("photographs", "board")):
             problem = "center: it is a point in the frame of the board, which is not used here; leave it out"
             raise ValueError(problem)
+        if len(self.bodies) not in (0, *range(2, MAX_BODIES + 1)):
+            raise ValueError(f"bodies: {len(self.bodies)} must be 2 to {MAX_BODIES}")
+        labels = [str(body.label).lower() for body in self.bodies.values()]
+        for body, label in zip(self.bodies, labels, strict=True):
+            if not NAME.fullmatch(body):
+                raise ValueError(f"bodies.{body}: a name has letters, digits, - and _")
+            if labels.count(label) > 1:
+                raise ValueError(f"bodies.{body}.label: another body has the label {label} as well")
+        if len({label.startswith("#") for label in labels}) > 1:
+            raise ValueError("bodies: labels must be all numbers or all colours")
+        if self.bodies and (self.object or self.density != 1000.0):
+            raise ValueError("object, density: of one body only; `bodies` have labels and densities instead")
         for name, mark in self.object.items():
             if len(mark) == 4 and (mark[2] - mark[0] < 8 or mark[3] - mark[1] < 8):
                 problem = f"object.{name}: expected [left, upper, right, lower] in pixels, 8 apart or more"
@@ -186,14 +217,12 @@ class ReleasedConfig(Section):
         description="metres per unit of the files, which are not metric: free fall is 1.33 times too fast. "
         "`flight/first.json` has the value that the frames before contact give",
     )
-    enlarge: float = Field(
-        2.5,
-        gt=0,
-        description="metres of the simulator per metre, `scale` in capture.yaml; for objects of 10 cm",
+    enlarge: float = internal(
+        2.5, "metres of the simulator per metre, `scale` in capture.yaml; for objects of 10 cm", gt=0
     )
     contact: int | None = internal(None, "frame of the first contact; null: from the files, or 5", ge=5)
     prior: str = Field("jelly", description="as in capture.yaml")
-    density: float = Field(1000.0, gt=0, description="as in capture.yaml [kg/m^3]")
+    density: float = internal(1000.0, "as in capture.yaml [kg/m^3]", gt=0)
     dt: float = internal(1 / 1920, "time step [s], a sixteenth of a frame of 1/120 s", gt=0, lt=0.01)
     grid: int | None = internal(None, "as in capture.yaml", ge=8)
     longest: int = internal(1000, "longer side of the stored photographs [px]", ge=64, le=8192)

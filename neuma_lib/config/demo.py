@@ -2,7 +2,7 @@
 
 from pydantic import Field
 
-from neuma_lib.config.base import Section
+from neuma_lib.config.base import Section, internal
 
 
 class DemoConfig(Section):
@@ -16,4 +16,4 @@ class DemoConfig(Section):
         "of the last one",
     )
     titles: dict[str, str] = Field({}, description="names of methods in the film, if not their own")
-    magnify: int = Field(2, ge=1, description="enlargement of the film")
+    magnify: int = internal(2, "enlargement of the film", ge=1)

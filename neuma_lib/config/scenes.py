@@ -69,29 +69,29 @@ OF_A_SPLAT = {
 
 
 class SceneBodyConfig(Section):
-    """One of several bodies of a scene, which touch each other."""
+    """One of several bodies of a scene, which touch each other. Those of a capture have no truth."""
 
-    shape: str = Field(description="name of a shape, or the path of a mesh, as of a scene")
+    shape: str | None = Field(description="name of a shape, or the path of a mesh, as of a scene")
     size: float | None = Field(
         None, gt=0, description="longest side of the bounding box [m]; null: the shape's own"
     )
-    height: float = Field(description="initial y of the centre of the bounding box [m]")
+    height: float | None = Field(description="initial y of the centre of the bounding box [m]")
     center: tuple[float, float] = Field(
         (0.5, 0.5), description="initial x and z of the centre of the bounding box [m]"
     )
     rotation: Vector = Field(
         (0.0, 0.0, 0.0), description="rotation vector of the shape, before it is placed [rad]"
     )
-    velocity: Vector = Field((0.0, 0.0, 0.0), description="initial velocity [m/s]")
+    velocity: Vector | None = Field((0.0, 0.0, 0.0), description="initial velocity [m/s]")
     spin: Vector = Field(
         (0.0, 0.0, 0.0), description="initial angular velocity about the centre of mass, world axes [rad/s]"
     )
     density: Annotated[float, Field(gt=0)] | SplitDensityConfig = Field(
         1000.0, description="mass density, as of a scene [kg/m^3]"
     )
-    law: LawConfig = Field(description="the true material")
+    law: LawConfig | None = Field(description="the true material")
     family: str | None = internal(None, "a name in identify.families if it is known; null: it is selected")
-    appearance: AppearanceConfig = Field(description="appearance in Blender")
+    appearance: AppearanceConfig | None = Field(description="appearance in Blender")
 
 
 class PairConfig(Section):
@@ -199,8 +199,11 @@ class SceneConfig(Section):
         if raw.get("splat"):
             return {**OF_A_SPLAT, **raw}
         if raw.get("bodies"):
-            return {**dict.fromkeys(OF_THE_TRUTH), "prior": "jelly", **raw}
-        return {**dict.fromkeys((*OF_THE_TRUTH, *OF_A_VIDEO)), **raw} if raw.get("captured") else raw
+            raw = {**dict.fromkeys(OF_THE_TRUTH), "prior": "jelly", **raw}
+        if not raw.get("captured"):
+            return raw
+        bodies = {name: {**dict.fromkeys(OF_THE_TRUTH), **own} for name, own in raw.get("bodies", {}).items()}
+        return {**dict.fromkeys((*OF_THE_TRUTH, *OF_A_VIDEO)), **raw, "bodies": bodies}
 
     @model_validator(mode="after")
     def _truth_is_whole(self) -> Self:
@@ -221,7 +224,11 @@ class SceneConfig(Section):
             return self
         if not 2 <= len(self.bodies) <= MAX_BODIES:
             raise ValueError(f"bodies: {len(self.bodies)} must be 2 to {MAX_BODIES}")
-        others = [key for key in (*OF_THE_TRUTH, "splat", "captured") if getattr(self, key) is not None]
+        for name, body in self.bodies.items() if self.captured is None else ():
+            for key in OF_THE_TRUTH:
+                if getattr(body, key) is None:
+                    raise ValueError(f"bodies.{name}.{key}: null is for captures only; give a value")
+        others = [key for key in (*OF_THE_TRUTH, "splat") if getattr(self, key) is not None]
         others += [key for key in ("clamps", "videos") if getattr(self, key)]
         if others or self.images != SuppliedConfig():
             raise ValueError(f"{', '.join(others or ['images'])}: exclude bodies; leave them out")

@@ -1,6 +1,6 @@
 """Mattes of photographs of any size, each cropped to its mask and downsampled if larger than needed."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from neuma_lib.io.images import (
     image_file,
     intrinsic_matrix,
     load_views,
+    read_hidden,
     read_rgba,
     read_transforms,
 )
@@ -35,6 +36,7 @@ class StaticViews:
         cameras: V cameras; V sets of one if sizes may differ.
         photographs: settings of photographs; None for rendered images, which are exact and have one exposure.
         floor: height y of the floor under the object [m]; None: no floor, or cameras see the underside.
+        hidden: pixels of each view that show another body, (H, W) each; None for images of a body without others.
         left_out: files of rejected photographs, whose masks lack a part of the body.
     """
 
@@ -43,6 +45,7 @@ class StaticViews:
     photographs: PhotographsConfig | None = None
     floor: float | None = None
     left_out: tuple[str, ...] = ()
+    hidden: Sequence[torch.Tensor] | None = None
 
     def to(self, device: torch.device) -> "StaticViews":
         """The same views on another device."""
@@ -61,20 +64,25 @@ def load_static(transforms: str | Path, settings: PhotographsConfig) -> StaticVi
         InputError: see `neuma_lib.io.images.read_image_set`; fewer than `MIN_PHOTOGRAPHS` photographs, or more than
             `MAX_LEFT_OUT` of them with masks that lack a part of the body.
     """
-    data = read_transforms(transforms)
+    data, labels = read_transforms(transforms), read_hidden(transforms)
+    hidden = None if labels is None else [*torch.from_numpy(labels)]
     if "photographs" not in data:
-        return StaticViews(*load_views(transforms))
+        return StaticViews(*load_views(transforms), hidden=hidden)
     names = [frame["file_path"] for frame in data["frames"]]
     if len(names) < MIN_PHOTOGRAPHS:
         problem = f"has {len(names)} mattes of photographs, at least {MIN_PHOTOGRAPHS} are needed"
         raise InputError(transforms, problem, "Take 30 to 60 photographs from all sides")
-    views = [_cut_out(Path(transforms), {**data, **frame}, settings) for frame in data["frames"]]
+    views = [
+        _cut_out(Path(transforms), {**data, **frame}, settings, labels[i] if hidden else None)
+        for i, frame in enumerate(data["frames"])
+    ]
     floor = data["photographs"]["floor"]
     kept = list(range(len(names)))
     if settings.lacking < 1:
-        shares = lacking(
-            [image[..., 3] for image, _ in views], [c for _, c in views], settings.agreement, floor
-        )
+        masks = [
+            image[..., 3] if other is None else image[..., 3].maximum(other) for image, _, other in views
+        ]
+        shares = lacking(masks, [camera for _, camera, _ in views], settings.agreement, floor)
         kept = (shares <= settings.lacking).nonzero()[:, 0].tolist()
     left_out = tuple(name for i, name in enumerate(names) if i not in kept)
     if len(left_out) > MAX_LEFT_OUT * len(names):
@@ -85,20 +93,25 @@ def load_static(transforms: str | Path, settings: PhotographsConfig) -> StaticVi
             "Provide your own masks for them, photograph the whole object in front of another colour, or set"
             " photographs.lacking",
         )
-    images, cameras = map(list, zip(*(views[i] for i in kept)))
-    return StaticViews(images, cameras, settings, floor, left_out)
+    images, cameras, others = map(list, zip(*(views[i] for i in kept)))
+    hidden = [other > 0.5 for other in others] if hidden else None
+    return StaticViews(images, cameras, settings, floor, left_out, hidden)
 
 
 def _cut_out(
-    listed_in: Path, frame: Mapping[str, Any], settings: PhotographsConfig
-) -> tuple[torch.Tensor, Cameras]:
-    """A matte (h, w, 4) cropped to its mask and a margin, and its camera."""
+    listed_in: Path, frame: Mapping[str, Any], settings: PhotographsConfig, hidden: np.ndarray | None
+) -> tuple[torch.Tensor, Cameras, torch.Tensor | None]:
+    """A matte (h, w, 4) cropped to its mask, the pixels that others hide and a margin; its camera; and these pixels."""
     file = image_file(listed_in.parent, frame["file_path"], listed_in)
     size = (frame["w"], frame["h"]) if "w" in frame and "h" in frame else None
     pixels = read_rgba(file, frame.get("sha256"), size)
     height, width = pixels.shape[:2]
     K = intrinsic_matrix(frame, width, height)
-    rows, columns = (np.flatnonzero((pixels[..., 3] > 127).any(axis=axis)) for axis in (1, 0))
+    known = pixels[..., 3] > 127
+    if hidden is not None:
+        known = known | hidden
+        pixels = np.dstack([pixels, 255 * hidden.astype(np.uint8)])
+    rows, columns = (np.flatnonzero(known.any(axis=axis)) for axis in (1, 0))
     margin = max(_MIN_MARGIN, round(settings.margin * max(np.ptp(rows), np.ptp(columns))))
     left, top = max(0, columns[0] - margin), max(0, rows[0] - margin)
     right, bottom = min(width, columns[-1] + 1 + margin), min(height, rows[-1] + 1 + margin)
@@ -110,17 +123,19 @@ def _cut_out(
         K[:2] *= factors[:, None]
     viewmat = np.linalg.inv(np.array(frame["transform_matrix"], np.float64) @ OPENGL_TO_OPENCV)
     pose, intrinsics = (torch.from_numpy(matrix).float()[None] for matrix in (viewmat, K))
-    return torch.from_numpy(window), Cameras(pose, intrinsics, window.shape[1], window.shape[0])
+    camera = Cameras(pose, intrinsics, window.shape[1], window.shape[0])
+    image, *other = torch.from_numpy(window).split([4, window.shape[2] - 4], dim=-1)
+    return image, camera, None if hidden is None else other[0][..., 0]
 
 
 def _reduced(rgba: np.ndarray, factor: float) -> tuple[np.ndarray, np.ndarray]:
-    """A matte downsampled by area means, and the scale factors in x and y."""
+    """A matte, and more channels, downsampled by area means, and the scale factors in x and y."""
     height, width = rgba.shape[:2]
     rows, columns = max(1, round(factor * height)), max(1, round(factor * width))
     # colours are weighted by alpha, because those of transparent pixels are arbitrary
-    weighted = np.concatenate([rgba[..., :3] * rgba[..., 3:], rgba[..., 3:]], axis=-1)
+    weighted = np.concatenate([rgba[..., :3] * rgba[..., 3:4], rgba[..., 3:]], axis=-1)
     small = _area_means(_area_means(weighted, rows).swapaxes(0, 1), columns).swapaxes(0, 1)
-    small[..., :3] /= np.maximum(small[..., 3:], 1e-6)
+    small[..., :3] /= np.maximum(small[..., 3:4], 1e-6)
     return np.clip(small, 0, 1).astype(np.float32), np.array([columns / width, rows / height])
 
 

@@ -29,6 +29,22 @@ class Capture:
     photographs: tuple[Path, ...]  # pictures of the object, sorted by name, possibly none yet
     stills: dict[str, Path]  # camera -> its picture of the empty scene
     takes: dict[str, dict[str, Path]]  # take -> camera -> video, cameras sorted by name, possibly none yet
+    body: str | None = None  # one of its several bodies. None for all, or the only one.
+
+    @property
+    def name(self) -> str:
+        """Folder of its results: of the capture, or of one of its bodies."""
+        return self.folder.name + (f"_{self.body}" if self.body else "")
+
+    @property
+    def source(self) -> str:
+        """Folder of the results with the reconstruction from photographs: its own, or that of another capture."""
+        return self.body and self.settings.bodies[self.body].capture or self.name
+
+    @property
+    def labels(self) -> dict[str, int | str]:
+        """Labels of all bodies in masks. Empty for one body."""
+        return {name: body.label for name, body in self.settings.bodies.items()}
 
     def pictures(self) -> dict[str, tuple[Path, ...]]:
         """Photographs and stills, by group. Raises InputError if photographs, or the still of a camera, are missing."""
@@ -60,8 +76,16 @@ class Capture:
         return tuple(self.takes[take])
 
     def own_masks(self, name: str) -> dict[str, Path]:
-        """Masks of the user in a subfolder, by file stem. Raises InputError for two masks of one picture."""
-        return _by_stem(self.folder, f"{self.settings.masks}/{name}", PICTURES)
+        """Masks of the user in a subfolder, by file stem.
+
+        Raises:
+            InputError: two masks of one picture, or none for pictures of several bodies.
+        """
+        masks = _by_stem(self.folder, f"{self.settings.masks}/{name}", PICTURES)
+        if self.settings.bodies and not masks:
+            where = self.folder / self.settings.masks / name
+            raise InputError(where, "no masks, which several bodies need", "Put label images there as PNG")
+        return masks
 
 
 def _no_videos(folder: Path) -> InputError:

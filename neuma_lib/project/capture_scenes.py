@@ -31,7 +31,8 @@ def captured_scenes(
     """Settings of the scenes of all captures in a folder, of released and of planned captures, by name.
 
     A capture ``mug`` has a scene ``mug`` for its photographs and a scene ``mug_<take>`` for each take. The law is
-    learned in the first of the `training_takes`. The others are its ``videos``.
+    learned in the first of the `training_takes`. The others are its ``videos``. Each of several bodies has a scene in
+    addition, ``mug_<body>`` and ``mug_<take>_<body>``, by `neuma_lib.project.loading`.
 
     Args:
         log: called for each capture, released or in the folder, that has no scenes, because it cannot be read or they
@@ -75,7 +76,11 @@ def checked_capture(folder: Path) -> Capture:
 def scenes_of(capture: Capture) -> dict[str, dict[str, Any]]:
     """Settings of the scenes of one capture, by name."""
     name, settings = capture.folder.name, capture.settings
-    common = {"prior": settings.prior, "density": settings.density, "dt": settings.dt}
+    common: dict[str, Any] = {"prior": settings.prior, "dt": settings.dt}
+    if settings.bodies:
+        common["bodies"] = {key: {"density": body.density} for key, body in settings.bodies.items()}
+    else:
+        common["density"] = settings.density
     world = {"capture": name, "scale": settings.scale, "grid": settings.grid}
     scenes = {name: {**common, "captured": world}}
     trained = training_takes(capture)
@@ -84,7 +89,11 @@ def scenes_of(capture: Capture) -> dict[str, dict[str, Any]]:
             **common,
             "captured": {**world, "throw": take, "cameras": list(cameras)},
             "training": {"views": list(range(len(cameras)))},
-            "videos": [scene_name(name, other) for other in trained[1:]] if take in trained[:1] else [],
+            "videos": (
+                [scene_name(name, other) for other in trained[1:]]
+                if take in trained[:1] and not settings.bodies
+                else []
+            ),
         }
     return scenes
 

@@ -82,7 +82,8 @@ def _laws(settings: Config) -> Iterator[tuple[str, dict[str, Any]]]:
         if scene.law is not None and name not in drawn and not scene.part_of:
             yield f"scenes.{name}.law", scene.law.plain()
         for key, body in scene.bodies.items() if name not in drawn else ():
-            yield f"scenes.{name}.bodies.{key}.law", body.law.plain()
+            if body.law is not None:
+                yield f"scenes.{name}.bodies.{key}.law", body.law.plain()
     for name, law in settings.priors.laws.items():
         yield f"priors.laws.{name}", law.plain()
     for name, law in settings.identify.families.items():
@@ -116,7 +117,7 @@ def _scene_problems(settings: Config, own_captures: bool = False) -> Iterator[st
         if own_captures:
             yield from map(str, prior_errors(settings, name))
         yield from _mesh_problems(*settings.colliders(name))
-        if scene.has_truth and not scene.part_of or scene.bodies:
+        if scene.has_truth and not scene.part_of or scene.bodies and not own_captures:
             truth = settings.scene_truth(name)
             for body in settings.scene_bodies(name):
                 own = f"{where}.bodies.{body['name']}" if scene.bodies else where

@@ -129,6 +129,8 @@ def _with_parts(scenes: Mapping[str, Any]) -> dict[str, Any]:
                 problem = f"the scene of the body {key} is called {part}, as another scene"
                 raise InputError(f"scenes.{name}.bodies.{key}", problem, "Rename one of the two")
             known = {field: value for field, value in body.items() if field in SceneConfig.model_fields}
+            if captured := pile["captured"]:
+                known["captured"] = {**captured, "capture": f"{captured['capture']}_{key}"}
             complete[part] = {**shared, **known, "part_of": [name, key]}
     return complete
 

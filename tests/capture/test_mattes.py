@@ -10,9 +10,16 @@ pytest.importorskip("cv2")
 
 from neuma_lib.capture.calibration.lens import Lens  # noqa: E402
 from neuma_lib.capture.masks import mattes  # noqa: E402
+from neuma_lib.capture.masks.regions import read_mask  # noqa: E402
 from neuma_lib.capture.masks.video_masks import given_masks  # noqa: E402
 from neuma_lib.capture.motion import flight
-from neuma_lib.io.images import OPENGL_TO_OPENCV, read_image_set, transform_world, write_transforms  # noqa: E402
+from neuma_lib.io.images import (  # noqa: E402
+    OPENGL_TO_OPENCV,
+    read_image_set,
+    read_labels,
+    transform_world,
+    write_transforms,
+)
 from neuma_lib.project.capture_folder import read_capture  # noqa: E402
 from tests.support.errors import refused  # noqa: E402
 
@@ -80,6 +87,55 @@ def test_own_masks_are_undistorted_as_their_pictures_are(tmp_path):
     expected = direction * lens.pinhole().K[[0, 1], [0, 1]] + lens.pinhole().K[:2, 2]
     assert np.linalg.norm(expected - (60, 20)) > 1
     np.testing.assert_allclose(middle, expected, atol=0.5)
+
+
+@pytest.mark.parametrize(
+    ("labels", "colours"),
+    [
+        ({"ball": 1, "block": 200}, [0, 1, 200]),
+        ({"ball": "#ff0000", "block": "#0040C0"}, [(0, 0, 0), (255, 0, 0), (0, 64, 192)]),
+    ],
+)
+def test_label_images_number_the_bodies(tmp_path, labels, colours):
+    """In the order of the settings, each undistorted as a mask; black is none of them. Written numbers are read."""
+    lens = Lens(WIDTH, HEIGHT, K, np.array([-0.4, 0, 0, 0, 0.0]))
+    numbers = disc(60, 20) + 2 * disc(25, 40).astype(np.uint8)
+    Image.fromarray(np.array(colours, np.uint8)[numbers]).save(tmp_path / "a.png")
+    result = mattes.own_mask(tmp_path / "a.png", lens, 1000, labels)
+    for k in (1, 2):
+        Image.fromarray(255 * (numbers == k).astype(np.uint8)).save(tmp_path / "b.png")
+        np.testing.assert_array_equal(result == k, mattes.own_mask(tmp_path / "b.png", lens, 1000))
+    frame = {"file_path": "0.png", **lens.pinhole().intrinsics(), "transform_matrix": np.eye(4).tolist()}
+    pixels = np.full((HEIGHT, WIDTH, 3), 90, np.uint8)
+    mattes.write_mattes(tmp_path / "out/transforms.json", [(frame, pixels, result)], {})
+    np.testing.assert_array_equal(read_labels(tmp_path / "out/transforms.json")[0], result)
+
+
+def test_label_images_of_a_palette_have_its_indices(tmp_path):
+    numbers = disc(60, 20) + 2 * disc(25, 40).astype(np.uint8)
+    image = Image.fromarray(numbers)
+    image.putpalette([0, 0, 0, 128, 0, 0, 0, 128, 0])
+    image.save(tmp_path / "a.png")
+    result = read_mask(tmp_path / "a.png", (WIDTH, HEIGHT), {"block": 2, "ball": 1})
+    np.testing.assert_array_equal(result, np.array([0, 2, 1])[numbers])
+
+
+def test_labels_of_no_body_are_refused(tmp_path):
+    """A forgotten body, and smoothed edges, are named with the most frequent label."""
+    Image.fromarray(np.array([0, 40, 90], np.uint8)[disc(60, 20) + 2 * disc(25, 40)]).save(tmp_path / "a.png")
+    with refused("a.png", problem="256 pixels have labels of no body, most of them 90; the bodies have 40"):
+        read_mask(tmp_path / "a.png", (WIDTH, HEIGHT), {"ball": 40, "block": 200})
+    with refused("a.png", problem="#5a5a5a"):
+        read_mask(tmp_path / "a.png", (WIDTH, HEIGHT), {"ball": "#282828", "block": "#ff0000"})
+    Image.new("L", (WIDTH, HEIGHT)).save(tmp_path / "b.png")
+    with refused("b.png", problem="empty"):
+        read_mask(tmp_path / "b.png", (WIDTH, HEIGHT), {"ball": 40, "block": 200})
+
+
+def test_several_bodies_need_masks(tmp_path):
+    (tmp_path / "capture.yaml").write_text("bodies: {ball: {label: 1}, block: {label: 2}}\n")
+    with refused("photographs", problem="no masks, which several bodies need"):
+        read_capture(tmp_path).own_masks("photographs")
 
 
 def test_own_masks_of_a_video_show_its_flight():

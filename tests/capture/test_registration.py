@@ -81,6 +81,30 @@ def test_pose_velocity_spin_offset_and_gains_are_those_that_were_rendered():
     assert all(each.seen.shape == each.rendered.shape for each in result.comparisons)
 
 
+def test_a_body_half_hidden_by_another_is_placed_at_a_common_time():
+    """The pixels of the other body, the left half in the first camera, are not background."""
+    body = ellipsoid_body(count=250)
+    motion = true_motion(body, Rotation.random(random_state=1).as_matrix())
+    first, second = filmed(body, motion, frames=8, noise=0.02)
+    images, hidden = first.images.copy(), np.zeros(first.images.shape[:3], bool)
+    for image, other in zip(images, hidden, strict=True):
+        other[:, : int(np.flatnonzero((image[..., 3] > 127).any(axis=0)).mean())] = True
+        image[other] = 0
+    sights = [replace(first, images=images, hidden=hidden), second]
+    start = float(first.times[3])
+    arguments = body.gaussians, body.particles, body.mass, sights, guess(), "one"
+    result = register(*arguments, start=start)
+    (R,), _ = motion.turn(np.array([start - 3.0]))
+    (centre,), (velocity,) = motion.place(np.array([start - 3.0]))
+    here = result.pose.motion
+    assert result.start == start and result.after.iou.min() > 0.95
+    assert np.degrees(angle_between(here.rotation, R)[0]) < 1.5
+    assert np.linalg.norm(here.centre - centre) < 0.003
+    assert np.linalg.norm(here.velocity - velocity) < 0.03 * np.linalg.norm(velocity)
+    with refused("one", problem="ends 500 ms before that of another body begins", remedy="same time"):
+        register(*arguments, start=float(min(sight.clock[-1] for sight in sights)) + 0.5)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2, 7))
 def test_every_rotation_is_recovered(seed):

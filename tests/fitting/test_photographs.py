@@ -15,7 +15,8 @@ from neuma_lib.fitting.gaussians import fit_gaussians
 from neuma_lib.geometry.surface import photographed, reconstruct
 from neuma_lib.geometry.visual_hull import lacking, visual_hull
 from neuma_lib.geometry.volume import check_mesh, inside, sample_volume, volume_iou
-from neuma_lib.io.images import OPENGL_TO_OPENCV, write_transforms
+from neuma_lib.io.files import read_json, write_json
+from neuma_lib.io.images import OPENGL_TO_OPENCV, list_body, write_transforms
 from neuma_lib.io.photographs import load_static
 from neuma_lib.splatting.cameras import Cameras
 from tests.support import raycast
@@ -110,6 +111,35 @@ def test_reduced_mattes_keep_cameras_areas_and_colours(duck, tmp_path):
         np.testing.assert_allclose(b[..., 3].mean(), a[..., 3].mean(), rtol=1e-4)
         mean = [(i[..., :3] * i[..., 3:]).sum((0, 1)) / i[..., 3].sum() for i in (a, b)]
         np.testing.assert_allclose(*mean, rtol=1e-4)
+
+
+def test_a_body_hidden_by_another_is_not_left_out(duck, tmp_path):
+    """In four views another body hides the left of the duck: these pixels stay in the picture, and may be the duck."""
+    images, cameras = duck
+    source = written(tmp_path, images, cameras, photographs={"floor": None})
+    data = read_json(source)
+    for k, (frame, image) in enumerate(zip(data["frames"], images)):
+        label = (image[..., 3].numpy() > 0.5).astype(np.uint8)
+        if k % 4 == 0:
+            label[:, : int(np.flatnonzero(label.any(axis=0)).mean())] *= 2
+        Image.fromarray(label).save(tmp_path / f"label{k}.png")
+        frame["label_path"] = f"label{k}.png"
+    write_json(source, data)
+    (tmp_path / "own").mkdir()
+    list_body(source, tmp_path / "own/transforms.json", 1)
+    views = load_static(tmp_path / "own/transforms.json", PhotographsConfig(margin=0.05))
+    assert views.left_out == ()
+    for k, (image, hidden) in enumerate(zip(views.images, views.hidden, strict=True)):
+        visible = image[..., 3] > 0.5
+        assert hidden.shape == visible.shape and not (hidden & visible).any()
+        assert bool(hidden.any()) == (k % 4 == 0)
+        whole = images[k][..., 3] > 0.5
+        assert (hidden | visible).sum() == whole.sum()
+    others = read_json(tmp_path / "own/transforms.json")
+    del others["body"]
+    write_json(tmp_path / "own/unknown.json", others)
+    left_out = load_static(tmp_path / "own/unknown.json", PhotographsConfig()).left_out
+    assert left_out and {*left_out} <= {f"{k}.png" for k in range(0, VIEWS, 4)}
 
 
 def test_rendered_views_are_read_as_they_are(duck, tmp_path):

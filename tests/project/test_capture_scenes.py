@@ -1,6 +1,7 @@
 """Captures as scenes, and their videos on the simulator's clock."""
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,11 +11,13 @@ from neuma_lib.capture.motion.synchronisation import (
     frame_times,
     reduced,
     reduced_intrinsics,
+    reduced_labels,
     without_gain,
 )
 from neuma_lib.config.capture import ReleasedConfig
 from neuma_lib.errors import InputError
 from neuma_lib.project import cases, checks
+from neuma_lib.project.capture_folder import read_capture
 from neuma_lib.project.capture_scenes import captured_scenes
 from neuma_lib.project.loading import load, read_yaml
 from neuma_lib.project.project import Project
@@ -107,6 +110,48 @@ def test_a_broken_capture_leaves_other_scenes_usable(captures, text):
     assert "cup/capture.yaml" in error.where and len(str(error).splitlines()) == 1
 
 
+BODIES = "bodies: {clay: {label: 40, density: 1500}, gum: {label: 200, capture: cup}}\n"
+
+
+def test_bodies_of_a_capture_are_scenes(captures):
+    settings(captures, "scale: 2\n" + BODIES)
+    config = loaded(captures)
+    pile, part = config.scenes["mug_one"], config.scenes["mug_one_clay"]
+    assert list(pile.bodies) == ["clay", "gum"] and pile.videos == () and not pile.has_truth
+    assert part.part_of == ("mug_one", "clay") and not part.has_truth and part.density == 1500
+    assert part.captured.capture == "mug_clay" and part.captured.throw == "one"
+    assert config.scenes["mug_gum"].part_of == ("mug", "gum")
+    assert config.body_scenes("mug_two") == ["mug_two_clay", "mug_two_gum"]
+    assert config.scene_world("mug_one_clay")["gravity"] == [0.0, -19.62, 0.0]
+    assert config.obstacles("mug_one") == {"contact": "particles"} and not checks.local_problems(config)
+    whole = read_capture(captures / "mug")
+    clay, gum = (replace(whole, body=name) for name in ("clay", "gum"))
+    assert (whole.name, clay.name, gum.name) == ("mug", "mug_clay", "mug_gum")
+    assert (clay.source, gum.source) == ("mug_clay", "cup")
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        (
+            "bodies: {clay: {label: 1}, gum: {label: 1}}",
+            "bodies.clay.label: another body has the label 1 as well",
+        ),
+        ("bodies: {clay: {label: 1}, gum: {label: '#ff0000'}}", "labels must be all numbers or all colours"),
+        ("bodies: {clay: {}, gum: {label: 2}}", "bodies.clay.label"),
+        ("bodies: {clay: {label: 0}, gum: {label: 2}}", "bodies.clay.label"),
+        ("bodies: {clay: {label: 1}}", "bodies: 1 must be 2 to 5"),
+        ("bodies: {a.b: {label: 1}, gum: {label: 2}}", "a name has letters"),
+        (BODIES + "density: 900", "of one body only"),
+    ],
+)
+def test_bodies_of_a_capture_that_are_refused(captures, text, problem):
+    settings(captures, text + "\n")
+    with pytest.raises(InputError) as caught:
+        read_capture(captures / "mug")
+    assert "mug/capture.yaml" in str(caught.value) and problem in str(caught.value)
+
+
 def test_a_capture_of_an_unknown_prior_leaves_other_scenes_usable(captures):
     """It is an error of `neuma check` and of the targets that read the prior."""
     settings(captures, "prior: jely\n")
@@ -185,6 +230,19 @@ def test_reduced_pictures_keep_coverage_and_colour_and_nothing_of_the_background
     assert (small[small[..., 3] > 0][:, :3] == (200, 100, 50)).all()
     assert not small[small[..., 3] == 0].any()
     assert reduced(rgba, 100) is rgba
+
+
+def test_reduced_labels_are_those_of_the_largest_share():
+    """Of blocks of 4 x 4 pixels. A block that bodies cover by less than half has none."""
+    labels = np.zeros((8, 12), np.uint8)
+    labels[:4, :4] = 2
+    labels[:4, :1] = 1
+    labels[:4, 4:7], labels[:2, 4:7] = 1, 3
+    labels[2:4, 5:7] = 3
+    labels[4:, :1] = 2
+    labels[4:, 4:5], labels[4:, 5:6] = 1, 2
+    labels[4:6, 6:7] = 2
+    np.testing.assert_array_equal(reduced_labels(labels, (3, 2), 3), [[2, 3, 0], [0, 2, 0]])
 
 
 def test_a_point_stays_on_its_part_of_a_reduced_picture():

@@ -8,8 +8,8 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from tests.support.board_pictures import BOARD, LENS, around, looking_at, picture
-from tests.support.films import ffmpeg
+from tests.support.board_pictures import BOARD, LENS, around, looking_at
+from tests.support.drawn_board import Eye, Solid, write_video
 from tests.support.project import copied
 
 PAGE = "tiny/results/mug/motion.md"
@@ -20,41 +20,12 @@ GRAVITY, RATE, COUNT, OFFSET = 9.81, 120, 40, 0.0035
 HEIGHT, VELOCITY, SPIN = 0.26, np.array([0.15, -0.1, 0.0]), np.array([1.0, 2.0, 0.5])
 
 
-class Eye:
-    """A camera of the drawn room: its empty picture, and the ellipsoid before it."""
-
-    def __init__(self, pose):
-        self.pose, self.empty = pose, np.repeat(picture(pose, samples=2)[..., None], 3, axis=2)
-        x, y = np.meshgrid(np.arange(LENS.width) + 0.5, np.arange(LENS.height) + 0.5)
-        rays = LENS.directions(np.stack([x.ravel(), y.ravel()], axis=1))
-        self.rays = np.concatenate([rays, np.ones((len(rays), 1))], axis=1) @ pose[:3, :3]
-        self.at = -pose[:3, :3].T @ pose[:3, 3]
-
-    def see(self, centre, turn):
-        """Picture (H, W, 3) and mask (H, W)."""
-        eye, rays = turn.inv().apply(self.at - centre) / RADII, turn.inv().apply(self.rays) / RADII
-        a, b, c = (rays**2).sum(axis=1), rays @ eye, eye @ eye - 1
-        root = b * b - a * c
-        hit = root > 0
-        body = eye + ((-b[hit] - np.sqrt(root[hit])) / a[hit])[:, None] * rays[hit]
-        grain = np.sin(9 * body[:, 0] + 1) * np.sin(11 * body[:, 1]) * np.sin(10 * body[:, 2] + 2)
-        seen = self.empty.copy().reshape(-1, 3)
-        seen[hit] = np.clip((205, 95, 50) * (1 + 0.35 * grain[:, None]), 0, 255)
-        return seen.reshape(self.empty.shape), hit.reshape(self.empty.shape[:2])
-
-
 def motion(t):
     """Centre in the board's frame, and the turn: free fall until the floor, where it stays."""
     landing = np.sqrt(2 * (HEIGHT - RADII[2]) / GRAVITY)
     t = min(t, landing)
     start = MIDDLE + (-0.02, 0.01, HEIGHT)
     return start + VELOCITY * t - (0, 0, GRAVITY * t * t / 2), Rotation.from_rotvec(SPIN * t)
-
-
-def write_video(path, pictures):
-    height, width = pictures[0].shape[:2]
-    raw = ("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", RATE, "-i", "-")
-    ffmpeg(*raw, "-c:v", "libx264", "-crf", 10, path, content=np.stack(pictures).tobytes())
 
 
 @pytest.fixture(scope="module")
@@ -65,15 +36,16 @@ def drawn(tmp_path_factory):
     for name in ("photos", "stills", "videos", "masks/photographs"):
         (root / name).mkdir(parents=True)
     for k, pose in enumerate(around(6)):
-        seen, mask = Eye(pose).see(MIDDLE + (0.0, 0.0, RADII[2]), Rotation.identity())
+        seen, mask = Eye(pose).see(Solid(MIDDLE + (0.0, 0.0, RADII[2]), Rotation.identity(), RADII))
         Image.fromarray(seen).save(root / f"photos/{k}.png")
-        Image.fromarray(255 * mask.astype(np.uint8)).save(root / f"masks/photographs/{k}.png")
+        Image.fromarray(255 * mask).save(root / f"masks/photographs/{k}.png")
     for name, angle, offset in (("left", 0.4, 0.0), ("right", 1.9, OFFSET)):
         at = MIDDLE + (0.6 * np.cos(angle), 0.6 * np.sin(angle), 0.4)
         eye = Eye(looking_at(at, MIDDLE + (0, 0, 0.1)))
         Image.fromarray(eye.empty).save(root / f"stills/{name}.png")
         write_video(
-            root / f"videos/{name}.mp4", [eye.see(*motion(k / RATE + offset))[0] for k in range(COUNT)]
+            root / f"videos/{name}.mp4",
+            [eye.see(Solid(*motion(k / RATE + offset), RADII))[0] for k in range(COUNT)],
         )
     (root / "lenses.json").write_text(
         json.dumps(dict.fromkeys(("photographs", "left", "right"), LENS.plain()))

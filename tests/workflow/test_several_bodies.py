@@ -1,8 +1,14 @@
 """A scene of several bodies: each reconstructed as a scene, all identified together, predicted without one of them."""
 
+import numpy as np
 import pytest
 import yaml
 
+from neuma_lib.geometry.shapes import place
+from neuma_lib.geometry.volume import signed_distance
+from neuma_lib.io.files import read_json
+from neuma_lib.io.gaussians import load_gaussians
+from neuma_lib.io.mesh import read_mesh
 from tests.conftest import ROOT
 from tests.support.project import copied, overlay
 
@@ -63,3 +69,49 @@ def test_bodies_together_and_one_alone_share_the_cores(project):
 def test_a_pile_has_no_fit_of_one_law(project):
     refused = project.run("--dry-run", *CHANGES, f"{RESULTS}/Pile/neuma/adaptor.safetensors", succeeds=False)
     assert "Pile_fish, Pile_duck, Pile_ball" in refused and "Traceback (most recent call last)" not in refused
+
+
+TOUCHING = {"duck": {"height": 0.4265}, "ball": {"height": 0.4265, "center": [0.6745, 0.5]}}
+"""Duck on the fish, and ball at the duck, 0.2 mm apart."""
+
+
+@pytest.mark.slow
+def test_bodies_that_touch_at_the_start(project):
+    """In the static pictures and in the first frame. The ball presses on the duck."""
+    bodies = {name: body | TOUCHING.get(name, {}) for name, body in PILE["bodies"].items()}
+    bodies["ball"]["velocity"] = [-0.6, -0.3, 0.0]
+    pile = PILE | {"bodies": bodies, "dt": 5e-4, "steps": 600}
+    families = {"fish": "drucker_prager", "duck": "fixed_corotated", "ball": "neo_hookean"}
+    changes = overlay(
+        scenes={"Pile": pile},
+        dataset={
+            "static": {"views": 24, "width": 96, "height": 96, "samples": 8},
+            "dynamic": {"views": 1, "width": 64, "height": 64, "samples": 8},
+        },
+        gaussians={"iterations": 400, "initial_count": 1000, "hull_resolution": 48},
+        geometry={"particles": 600, "surface": {"resolution": 48}},
+        simulation={"grid": 24},
+        advanced={f"scenes.Pile.bodies.{name}.family": family for name, family in families.items()},
+    )
+    runs = [project.root / RESULTS / "Pile" / method / "metrics.json" for method in ("constants", "true_law")]
+    project.run(*changes, *(str(file.relative_to(project.root)) for file in runs))
+    results = project.root / RESULTS
+    solids = [
+        place(body["shape"], body["size"], body["height"], body.get("center", (0.5, 0.5)))
+        for body in bodies.values()
+    ]
+    count = wrong = 0
+    for k, (name, solid) in enumerate(zip(bodies, solids, strict=True)):
+        means = load_gaussians(results / f"Pile_{name}/gaussians.ply").means.numpy().astype(float)
+        nearest = np.argmin([signed_distance(each, means) for each in solids], axis=0)
+        count, wrong = count + len(means), wrong + int((nearest != k).sum())
+        if name != "fish":  # whose fins are thinner than a pixel
+            assert read_mesh(results / f"Pile_{name}/mesh.ply").volume == pytest.approx(
+                solid.volume, rel=0.03
+            )
+    assert count == len(load_gaussians(results / "Pile/whole.ply").means) and wrong < 0.005 * count
+    identified, true = ([body["tracer_rmse_mm"] for body in read_json(file)["bodies"]] for file in runs)
+    assert np.mean(identified) < 1.5 * np.mean(true)
+    pairs = {frozenset(pair["bodies"]): pair for pair in read_json(results / "Pile/identified.json")["pairs"]}
+    pressed = pairs[frozenset(("duck", "ball"))]
+    assert abs(np.log(pressed["friction"] / 0.3)) < 3 * pressed["log_std"] < 1.5

@@ -4,15 +4,16 @@
 rule capture_registration:
     input:
         kernels=kernels("rendering"),
-        gaussians=captured_file(f"{RESULTS}/{{capture}}/gaussians.ply"),
-        mesh=captured_file(f"{RESULTS}/{{capture}}/mesh.ply"),
-        sampled=captured_file(f"{RESULTS}/{{capture}}/sampled_particles.h5"),
-        particles=captured_file(f"{RESULTS}/{{capture}}/particles.h5"),
-        binding=captured_file(f"{RESULTS}/{{capture}}/binding.h5"),
-        photographs=captured_file(f"{DATA}/{{capture}}/static/transforms.json"),
+        gaussians=captured_file(f"{RESULTS}/{{source}}/gaussians.ply"),
+        mesh=captured_file(f"{RESULTS}/{{source}}/mesh.ply"),
+        sampled=captured_file(f"{RESULTS}/{{source}}/sampled_particles.h5"),
+        particles=captured_file(f"{RESULTS}/{{source}}/particles.h5"),
+        binding=captured_file(f"{RESULTS}/{{source}}/binding.h5"),
+        photographs=captured_file(f"{DATA}/{{source}}/static/transforms.json"),
         transforms=of_take_cameras(MATTES),
         timelines=of_take_cameras(f"{VIDEO_FRAMES}.json"),
         flight=captured_file(f"{FLIGHT}.json"),
+        flights=of_take_bodies(f"{FLIGHT}.json"),
     output:
         gaussians=f"{RESULTS}/{{scene}}/gaussians.ply",
         mesh=f"{RESULTS}/{{scene}}/mesh.ply",
@@ -23,7 +24,7 @@ rule capture_registration:
         registration=f"{RESULTS}/{{scene}}/registration.json",
         picture=f"{RESULTS}/{{scene}}/registration.png",
     wildcard_constraints:
-        scene=TAKE_SCENE,
+        scene=REGISTERED_SCENE,
     params:
         cameras=scene_cameras,
         timing=camera_timing,

@@ -5,11 +5,11 @@ rule capture_video:
     input:
         transforms=of_take_cameras(MATTES),
         timelines=of_take_cameras(f"{VIDEO_FRAMES}.json"),
-        registration=f"{RESULTS}/{{scene}}/registration.json",
+        registration=of_each_body(lambda wildcards: f"{RESULTS}/{wildcards.scene}/registration.json"),
     output:
         transforms=f"{DATA}/{{scene}}/dynamic/transforms.json",
     wildcard_constraints:
-        scene=TAKE_SCENE,
+        scene=FILMED_SCENE,
     params:
         cameras=scene_cameras,
         timing=camera_timing,

@@ -1,5 +1,6 @@
 """Files and settings of captures (docs/capture.md). Needs scenes.smk."""
 
+from dataclasses import replace
 from functools import cache
 
 from neuma_lib.config.variants import NAME, RESERVED
@@ -16,6 +17,7 @@ OF_VIDEOS = (
     "density",
     "dt",
     "held_out",
+    "bodies",
     "duration",
     "frames",
     "width",
@@ -28,9 +30,10 @@ VIDEO_FRAMES = f"{RESULTS}/{{capture}}/frames/{VIDEO}"
 FLIGHT = f"{RESULTS}/{{capture}}/flight/{{take}}"
 
 # Names of folders with other results.
-OTHERS = "|".join([TRUE_SCENE, PILE_SCENE, SPLAT_SCENE, *RESERVED])
+OTHERS = "|".join([TRUE_SCENE, DRAWN_PILE, SPLAT_SCENE, *RESERVED])
 RELEASED_CAPTURE = names_of(SETTINGS.captures.released, replicates=False)
-OWN_CAPTURE = f"(?!({OTHERS}|{RELEASED_CAPTURE})/){NAME.pattern}"
+FILMED_CAPTURE = f"(?!({OTHERS}|{RELEASED_CAPTURE})/){NAME.pattern}"  # or one of its bodies
+OWN_CAPTURE = f"(?!{CAPTURED_PART}/){FILMED_CAPTURE}"
 RELEASED_TAKE = scenes_that(
     lambda scene: scene.captured and scene.captured.capture in SETTINGS.captures.released, replicates=False
 )
@@ -47,6 +50,9 @@ wildcard_constraints:
 def capture_named(name):
     if name in SETTINGS.captures.released:
         return released_captures({name: SETTINGS.captures.released[name]})[name]
+    if name in SETTINGS.scenes and SETTINGS.scenes[name].part_of:
+        whole, body = SETTINGS.scenes[name].part_of
+        return replace(capture_named(whole), body=body)
     return PLANNED.get(name) or read_capture(f"{CAPTURES}/{name}")
 
 
@@ -74,8 +80,48 @@ def of_video(choose):
 
 
 def captured_file(pattern):
-    """A function of wildcards: a file of their capture or take."""
-    return of_take(lambda capture, take: pattern.format(capture=capture.folder.name, take=take))
+    """A function of wildcards: a file of their capture or take, or of the room that all bodies of a capture share."""
+    return of_take(
+        lambda capture, take: pattern.format(
+            capture=capture.name, take=take, room=capture.folder.name, source=photographed(capture)
+        )
+    )
+
+
+def photographed(capture):
+    """Name of the scene with the photographs of a capture, or of one of its bodies."""
+    name, where = capture.source, f"{capture.folder / 'capture.yaml'}: bodies.{capture.body}.capture"
+    if capture.body is None:
+        return name
+    if name not in SETTINGS.scenes or SETTINGS.scenes[name].bodies or not SETTINGS.scenes[name].captured:
+        raise InputError(where, f"no capture '{name}' of one body", "Name a folder of captures")
+    scales = SETTINGS.scenes[name].captured.scale, capture.settings.scale
+    if scales[0] != scales[1]:
+        raise InputError(
+            where, f"the scale of '{name}' is {scales[0]:g}, but {scales[1]:g} here", "Set one scale"
+        )
+    return name
+
+
+def parts_of(capture):
+    """The bodies of a capture as captures, or the capture of one body itself."""
+    return [replace(capture, body=body) for body in capture.labels] or [capture]
+
+
+def of_take_bodies(pattern):
+    """A function of wildcards: a file of each body of their take."""
+    return of_take(
+        lambda capture, take: [pattern.format(capture=part.name, take=take) for part in parts_of(capture)]
+    )
+
+
+def of_body_videos(pattern):
+    """A function of wildcards: a file for each body in each video of their capture."""
+    return of_capture(
+        lambda capture: [
+            file for part in parts_of(capture) for file in video_files(pattern, part, part.takes)
+        ]
+    )
 
 
 def of_take_cameras(pattern):
@@ -89,7 +135,7 @@ def of_videos(pattern):
 
 
 def video_files(pattern, capture, takes):
-    name = capture.folder.name
+    name = capture.name
     return [
         pattern.format(capture=name, take=take, camera=camera)
         for take in takes
@@ -98,10 +144,19 @@ def video_files(pattern, capture, takes):
 
 
 def of_takes(pattern):
-    """A function of wildcards: a file for each take of their capture."""
+    """A function of wildcards: a file for each take of their capture, or for each body in it."""
     return of_capture(
-        lambda capture: [pattern.format(capture=capture.folder.name, take=take) for take in capture.takes]
+        lambda capture: [
+            pattern.format(capture=part.name, take=take) for part in parts_of(capture) for take in part.takes
+        ]
     )
+
+
+def take_titles(capture):
+    """Names of takes, in the order of `of_takes`."""
+    return [
+        take + (f", {part.body}" if part.body else "") for part in parts_of(capture) for take in part.takes
+    ]
 
 
 def capture_setting(name):
@@ -134,10 +189,20 @@ def videos_of(capture):
     return [(take, camera) for take, cameras in capture.takes.items() for camera in cameras]
 
 
+def body_videos_of(capture):
+    """Take, with the body, and camera of all videos, in the order of `of_body_videos`."""
+    titled = zip(take_titles(capture), [take for _ in parts_of(capture) for take in capture.takes])
+    return [(title, camera) for title, take in titled for camera in capture.takes[take]]
+
+
 def saliency_network(capture):
     """The network, if a photograph has no mask of the user."""
     own = capture.own_masks("photographs")
-    return [] if all(p.stem in own for p in capture.photographs) else [f"{DATA}/weights/u2netp.onnx"]
+    return (
+        []
+        if capture.labels or all(p.stem in own for p in capture.photographs)
+        else [f"{DATA}/weights/u2netp.onnx"]
+    )
 
 
 def marked_photographs(capture):

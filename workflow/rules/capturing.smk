@@ -20,7 +20,7 @@ rule capture_frames:
         timeline=f"{VIDEO_FRAMES}.json",
         sheet=f"{VIDEO_FRAMES}.png",
     wildcard_constraints:
-        capture=OWN_CAPTURE,
+        capture=FILMED_CAPTURE,
     params:
         rate=VIDEO_RATE,
         name="{capture}, {take}, {camera}",

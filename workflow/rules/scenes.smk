@@ -127,10 +127,10 @@ def origin_of(part, scene):
     A truth is always simulated, also where the user supplies the video. All of a capture is 'captured'. A splat has
     neither images nor a truth.
     """
-    if SETTINGS.scenes[scene].bodies:
-        return "made"
     if SETTINGS.scenes[scene].part_of:
         return "part"
+    if SETTINGS.scenes[scene].bodies and not SETTINGS.scenes[scene].captured:
+        return "made"
     if not SETTINGS.scenes[scene].has_truth:
         return "captured" if SETTINGS.scenes[scene].captured else "none"
     if getattr(SETTINGS.scenes[scene].images, "dynamic" if part == "truth" else part):

@@ -109,7 +109,10 @@ def scenes_that(holds, replicates=True):
 TRUE_SCENE = scenes_that(lambda scene: scene.has_truth)
 # A scene of several bodies has a scene for each of them, which sees nothing of the others.
 PILE_SCENE = scenes_that(lambda scene: scene.bodies)
-PART_SCENE = scenes_that(lambda scene: scene.part_of)
+DRAWN_PILE = scenes_that(lambda scene: scene.bodies and not scene.captured)
+PART_SCENE = scenes_that(lambda scene: scene.part_of and not (scene.captured and scene.captured.throw))
+DRAWN_PART = scenes_that(lambda scene: scene.part_of and not scene.captured)
+CAPTURED_PART = scenes_that(lambda scene: scene.part_of and scene.captured, replicates=False)
 SINGLE_SCENE = scenes_that(lambda scene: not scene.bodies)
 LONE_SCENE = scenes_that(lambda scene: scene.has_truth and not scene.part_of)
 SPLAT_SCENE = scenes_that(lambda scene: scene.splat)
@@ -120,6 +123,12 @@ PICTURED_SCENE = scenes_that(
     )
 )
 TAKE_SCENE = scenes_that(lambda scene: scene.captured and scene.captured.throw, replicates=False)
+REGISTERED_SCENE = scenes_that(
+    lambda scene: scene.captured and scene.captured.throw and not scene.bodies, replicates=False
+)
+FILMED_SCENE = scenes_that(
+    lambda scene: scene.captured and scene.captured.throw and not scene.part_of, replicates=False
+)
 # Experiments have their own folder. Rules that also accept scenes have the wildcard `scene` for both.
 EXPERIMENT = f"experiments/{names_of(SETTINGS.experiments)}"
 

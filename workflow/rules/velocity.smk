@@ -43,7 +43,7 @@ use rule velocity as velocity_of_bodies with:
     output:
         velocity=f"{RESULTS}/{{scene}}/motions.json",
     wildcard_constraints:
-        scene=PILE_SCENE,
+        scene=DRAWN_PILE,
     params:
         simulation=simulation_settings,
         densities=densities_of(SETTINGS.body_scenes),
@@ -58,7 +58,7 @@ rule body_velocity:
     output:
         velocity=f"{RESULTS}/{{scene}}/velocity.json",
     wildcard_constraints:
-        scene=PART_SCENE,
+        scene=DRAWN_PART,
     params:
         bodies=of_pile(of_section(lambda scene: list(scene.bodies))),
         body=of_section(lambda scene: scene.part_of[1]),

@@ -1,5 +1,6 @@
 """Fit the free flight of a take in all cameras, and check gravity."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +34,8 @@ def main(inputs, output, params, run) -> None:
     with evidence(output.picture, lambda path: draw_tracks(path, views, params.name)):
         cues = read_cues(read_json(room)["up"]) if room else ()
         flight = find_flight(views, params.name, params.metric, cues)
+        if params.get("hidden"):
+            flight = replace(flight, agreement=None)
         if room and flight.agreement is not None:
             check_one_object(flight.agreement, params.cameras, params.name)
         if room and not params.metric:

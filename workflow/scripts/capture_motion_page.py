@@ -1,5 +1,6 @@
 """Page of a capture's masks and free flights: checks and pictures."""
 
+import os
 from pathlib import Path
 
 from neuma_lib.capture.report.page import markdown, motion_checks
@@ -20,7 +21,7 @@ def main(inputs, output, params, run) -> None:
         **{f"Masks: {name}": sheet for name, sheet in zip(names, listed(inputs.sheets))},
         **{f"Free flight: {t}": picture for t, picture in zip(params.takes, listed(inputs.pictures))},
     }
-    pictures = {caption: str(Path(file).relative_to(folder)) for caption, file in files.items()}
+    pictures = {caption: os.path.relpath(file, folder) for caption, file in files.items()}
     missing = None if names else "There are no videos yet."
     write_text(output.page, markdown(params.title, checks, pictures, missing))
     for check in checks:

@@ -73,7 +73,9 @@ def main(inputs, output, params, run) -> None:
             )
     for k, (frame, name) in enumerate(zip(frames, names)):
         if is_own[k]:
-            masks[k] = own_mask(own[name], lens, params.longest)
+            masks[k] = own_mask(own[name], lens, params.longest, params.labels)
+        elif params.labels:
+            masks[k] = np.zeros(pictures[k].shape[:2], np.uint8)
         elif not boxes:
             outline = board_outline(board, params.center, *metric_camera(frame, world)) if board else None
             masks[k] = photograph_mask(pictures[k], network, frame["file_path"], outline)
@@ -84,6 +86,8 @@ def main(inputs, output, params, run) -> None:
         [values[k] for k in selected] for values in (frames, names, pictures, masks, is_own)
     )
     cameras, Ks = cameras[selected], Ks[selected]
+    labelled = dict(zip(names, masks)) if params.labels else {}
+    masks = [mask > 0 for mask in masks]
     ious = np.ones(1)
 
     def draw(path: Path) -> None:
@@ -117,7 +121,7 @@ def main(inputs, output, params, run) -> None:
     summary = f"{sum(kept)} of {total} masks agree, mean IoU {np.mean(ious[kept]):.2f} with their visual hull"
     picture_sheet(output.sheet, sheet, f"{params.name}: {summary}", 6)
     mattes = [
-        ({**frame, "file_path": f"{name}.png"}, pixels, mask)
+        ({**frame, "file_path": f"{name}.png"}, pixels, labelled.get(name, mask))
         for frame, name, pixels, mask, good in zip(frames, names, pictures, masks, kept)
         if good
     ]

@@ -14,7 +14,7 @@ from neuma_lib.capture.registration.rigid_views import Sight
 from neuma_lib.errors import InputError
 from neuma_lib.io.files import atomic, listed, read_json, write_json
 from neuma_lib.io.gaussians import load_gaussians, save_gaussians
-from neuma_lib.io.images import read_transforms
+from neuma_lib.io.images import read_hidden, read_transforms
 from neuma_lib.io.particles import load_particles, save_particles
 from neuma_lib.io.ply import read_ply, write_ply
 from neuma_lib.splatting.rigid import moved
@@ -26,6 +26,7 @@ KNOWN_SPIN = 3.0
 
 def main(inputs, output, params, run) -> None:
     flight, gaussians = read_json(inputs.flight), load_gaussians(inputs.gaussians)
+    flights = [read_json(file) for file in listed(inputs.flights)]  # of all bodies
     x, vol0, _ = load_particles(inputs.particles)
     files = zip(
         params.cameras,
@@ -48,6 +49,7 @@ def main(inputs, output, params, run) -> None:
         scale_known,
         run.progress,
         floor=float(world.get("offset", [0.0, 0.0, 0.0])[1]),
+        start=max(each["start_s"] for each in flights) if len(flights) > 1 else None,
     )
     gravity = Gravity(
         registered.gravity / scale,
@@ -114,7 +116,9 @@ def sight(camera, transforms, timeline, row_time, flight, name) -> Sight:
     times = frame_times(frames, pixels, row_time, read_json(timeline)["height"])
     known = flight["offsets_deviation_s"][camera] == 0
     viewmat, K = metric_camera(frames[0], {})
-    return Sight(camera, times, pixels, viewmat, K, flight["offsets_s"][camera], known)
+    hidden = read_hidden(transforms)
+    hidden = None if hidden is None else hidden[flying]
+    return Sight(camera, times, pixels, viewmat, K, flight["offsets_s"][camera], known, hidden)
 
 
 def parabola(flight, scale, offset, metric) -> Parabola:

@@ -43,6 +43,7 @@ def main(inputs, output, params, run) -> None:
     # Direction of -y of the room in the picture. Cameras have OpenGL axes.
     down = -np.array(still["transform_matrix"])[1, :2] * [1.0, -1.0]
     own = {Path(file).stem: file for file in listed(inputs.own)}
+    body = 1 + list(params.labels).index(params.body) if params.body else None
     if own:
         numbers, shift = _named(own, len(timeline.times)), None
     else:
@@ -62,8 +63,8 @@ def main(inputs, output, params, run) -> None:
     with evidence(output.sheet, draw_frames):
         if own:
             files = {int(stem): file for stem, file in own.items()}
-            masks = np.stack([own_mask(files[n], lens, params.longest) for n in numbers])
-            result = given_masks(masks, timeline.times[numbers], down)
+            labels = np.stack([own_mask(files[n], lens, params.longest, params.labels) for n in numbers])
+            result = given_masks(_of_body(labels, params, body), timeline.times[numbers], down)
         else:
             result = video_masks(pictures, inputs.video, background, timeline.times[numbers], down=down)
     masks, areas = result.masks, result.areas
@@ -92,12 +93,12 @@ def main(inputs, output, params, run) -> None:
         (
             {**still, "file_path": f"{number:05d}.png", "step": number, "time": time},
             pixels,
-            masks[k],
+            labels[k] if params.labels else masks[k],
         )
         for k in visible
         for number, time, pixels in [frame(k)]
     )
-    write_mattes(output.transforms, mattes, world_of(inputs.room))
+    write_mattes(output.transforms, mattes, world_of(inputs.room), body)
     flying = areas[flight[0] : flight[1] + 1] if flight else areas[:0]
     write_json(
         output.report,
@@ -144,6 +145,15 @@ def _search(video, timeline, lens, background, down, params, output) -> tuple[np
     with evidence(output, lambda path: contact_sheet(path, [first, *sheet[::2]], text)):
         shift = check_fixed(list(shifts.values()), list(shifts), longest, video)
     return timeline.numbers[window], shift
+
+
+def _of_body(labels, params, body) -> np.ndarray:
+    """Masks (T, H, W) of the object, or of one of several bodies. Raises InputError if no frame shows it."""
+    masks = labels == body if body else labels > 0
+    if not masks.any():
+        problem = f"no mask has the label {params.labels[params.body]} of {params.body}"
+        raise InputError(params.name, problem, "Correct the masks, or `bodies` in capture.yaml")
+    return masks
 
 
 def _named(own, count) -> np.ndarray:

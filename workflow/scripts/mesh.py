@@ -2,8 +2,6 @@
 
 from pathlib import Path
 
-import torch
-
 from neuma_lib.capture.gates import check_volume, draw_body
 from neuma_lib.capture.pictures import evidence
 from neuma_lib.config.geometry import SurfaceConfig
@@ -11,7 +9,6 @@ from neuma_lib.config.photographs import PhotographsConfig
 from neuma_lib.geometry.surface import photographed, reconstruct
 from neuma_lib.geometry.visual_hull import visual_hull
 from neuma_lib.io.gaussians import load_gaussians
-from neuma_lib.io.images import read_hidden
 from neuma_lib.io.mesh import write_mesh
 from neuma_lib.io.photographs import load_static
 from neuma_lib.splatting.labels import without_others
@@ -23,13 +20,17 @@ _HULL_RESOLUTION = 48  # voxels along the longest side of the visual hull, to co
 def main(inputs, output, params, run) -> None:
     views = load_static(inputs.transforms, PhotographsConfig(**params.photographs))
     surface = SurfaceConfig(**params.surface)
-    gaussians, images, hidden = load_gaussians(inputs.gaussians), views.images, read_hidden(inputs.transforms)
-    if hidden is not None:
-        images = without_others(gaussians, views.cameras, images, torch.from_numpy(hidden))
+    gaussians, images = load_gaussians(inputs.gaussians), views.images
+    if views.hidden is not None:
+        pairs = zip(images, views.hidden, strict=True)
+        images = [
+            without_others(gaussians, views.cameras[k], image[None], hidden[None])[0]
+            for k, (image, hidden) in enumerate(pairs)
+        ]
     mesh = reconstruct(gaussians, views.cameras, images, surface, views.floor)
     if views.photographs:
         mesh = photographed(mesh, views.photographs.edge, views.floor)
-        masks, name = [image[..., 3] for image in views.images], Path(inputs.transforms).parent.parent.name
+        masks, name = [image[..., 3] for image in images], Path(inputs.transforms).parent.parent.name
         hull = visual_hull(masks, views.cameras, _HULL_RESOLUTION, views.floor)
         inside = (hull.origin + (hull.occupied.nonzero() + 0.5) * hull.voxel).cpu().numpy()
         volume = len(inside) * hull.voxel**3

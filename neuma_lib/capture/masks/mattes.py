@@ -25,10 +25,27 @@ def room_frames(path: str | Path, group: str) -> list[dict[str, Any]]:
     return frames
 
 
-def own_mask(path: str | Path, lens: Lens, longest: int) -> np.ndarray:
-    """A mask of the user, undistorted like its picture, (H, W). Raises InputError as `read_mask`."""
-    mask = read_mask(path, (lens.width, lens.height))
-    return undistorted(255 * mask.astype(np.uint8), lens, longest) > 127
+def own_mask(
+    path: str | Path, lens: Lens, longest: int, labels: Mapping[str, int | str] | None = None
+) -> np.ndarray:
+    """A mask of the user, undistorted like its picture, (H, W), with numbers of bodies if there are labels.
+
+    Raises InputError as `read_mask`.
+    """
+    mask = read_mask(path, (lens.width, lens.height), labels)
+    numbers = range(1, 1 + len(labels or [""]))
+    shares = [undistorted(255 * (mask == k).astype(np.uint8), lens, longest) for k in numbers]
+    return numbered(np.stack(shares)) if labels else shares[0] > 127
+
+
+def numbered(shares: np.ndarray) -> np.ndarray:
+    """Number, from 1, of the body with the largest share of each pixel, where all cover more than half of it, else 0.
+
+    Args:
+        shares: of each body, (bodies, H, W), 0 to 255.
+    """
+    covered = shares.sum(axis=0, dtype=np.float32) > 127
+    return np.where(covered, 1 + shares.argmax(axis=0), 0).astype(np.uint8)
 
 
 def metric_camera(frame: Mapping[str, Any], world: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
@@ -68,25 +85,37 @@ class Mattes(Sequence[np.ndarray]):
         return read_rgba(file, frame.get("sha256"), size)
 
 
+def write_labels(folder: Path, name: str, labels: np.ndarray) -> str:
+    """Write the numbers of bodies (H, W) in a picture of a name, and return their ``label_path`` in a list."""
+    (folder / "labels").mkdir(exist_ok=True)
+    write_png(folder / "labels" / name, labels)
+    return f"labels/{name}"
+
+
 def write_mattes(
     path: str | Path,
     mattes: Iterable[tuple[dict[str, Any], np.ndarray, np.ndarray]],
     world: Mapping[str, Any],
+    body: int | None = None,
 ) -> None:
     """Write a transforms.json and the RGBA pictures that it lists.
 
     Args:
         path: .../transforms.json.
-        mattes: entry with the ``file_path`` to write to, pixels (H, W, 3), uint8, and mask (H, W) of each picture.
+        mattes: entry with the ``file_path`` to write to, pixels (H, W, 3), uint8, and mask (H, W) of each picture. A
+            mask with numbers of bodies is written as well (`neuma_lib.io.images.read_labels`).
         world: entries of the file that describe the world of its cameras, see `world_of`.
+        body: number of the body that the pictures show (`neuma_lib.io.images.read_hidden`). None: all.
     """
     folder = Path(path).parent
     folder.mkdir(parents=True, exist_ok=True)
     Path(path).unlink(missing_ok=True)  # a folder without it is incomplete
     frames = []
     for frame, pixels, mask in mattes:
-        rgba = matted(pixels, mask)
+        rgba = matted(pixels, mask == body if body else mask > 0)
         rgba[rgba[..., 3] == 0] = 0  # compresses better
         write_png(folder / frame["file_path"], rgba)
+        if mask.dtype != bool:
+            frame = {**frame, "label_path": write_labels(folder, frame["file_path"], mask)}
         frames.append({key: value for key, value in frame.items() if key != "sha256"})
-    write_transforms(path, {}, frames, **world)
+    write_transforms(path, {}, frames, **world, **({"body": body} if body else {}))

@@ -5,10 +5,11 @@ Pictures are RGB, uint8, (H, W, 3). Masks are Boolean, (H, W). Positions are (x,
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 from scipy import ndimage
 
 from neuma_lib.capture.frames import Frame
@@ -77,21 +78,28 @@ def overlay(frame: Frame, mask: np.ndarray) -> Frame:
     return frame._replace(pixels=pixels.astype(np.uint8))
 
 
-def read_mask(path: str | Path, size: tuple[int, int]) -> np.ndarray:
+def read_mask(
+    path: str | Path, size: tuple[int, int], labels: Mapping[str, int | str] | None = None
+) -> np.ndarray:
     """Read a mask of the user: opaque pixels of a picture with alpha, else pixels brighter than half, (H, W).
 
     Args:
         path: PNG, JPEG or WebP.
         size: width and height of its picture [px].
+        labels: of several bodies by name, grey values, palette indices or colours. The mask then has the number of the
+            body in each pixel, from 1, or 0 where the picture is black or transparent, uint8.
 
     Raises:
-        InputError: missing, damaged, of another size, or empty.
+        InputError: missing, damaged, of another size, or empty; a label of no body.
     """
     content = read_regular(existing(path, "Put the mask there, or remove it from the settings"))
     with open_image(content, path) as image, reading(path, "a mask"):
         image.load()
         has_alpha = "A" in image.mode or "transparency" in image.info
-        mask = np.asarray(image.convert("RGBA").getchannel("A") if has_alpha else image.convert("L")) > 127
+        alpha = np.asarray(image.convert("RGBA").getchannel("A"))
+        mask = (alpha if has_alpha else np.asarray(image.convert("L"))) > 127
+        if labels:
+            mask = _numbers(image, labels, path) * (alpha > 127).astype(np.uint8)
     if (
         mask.shape == tuple(size) != mask.shape[::-1]
     ):  # of a picture that is stored turned, see `read_picture`
@@ -109,6 +117,28 @@ def read_mask(path: str | Path, size: tuple[int, int]) -> np.ndarray:
             "Draw the object in white, or delete the file if its picture does not show the object",
         )
     return mask
+
+
+def _numbers(image: Image.Image, labels: Mapping[str, int | str], path: str | Path) -> np.ndarray:
+    """Number of the body of each pixel, in the order of the labels, from 1, (H, W), uint8."""
+    coloured = any(isinstance(label, str) for label in labels.values())
+    if coloured:
+        values = np.asarray(image.convert("RGB"), np.uint32) @ np.array([1 << 16, 1 << 8, 1], np.uint32)
+    else:
+        values = np.asarray(image if image.mode == "P" else image.convert("L"), np.uint32)
+    numbers = np.zeros(values.shape, np.uint8)
+    for k, label in enumerate(labels.values(), 1):
+        numbers[values == (int(label[1:], 16) if isinstance(label, str) else label)] = k
+    unknown, counts = np.unique(values[(numbers == 0) & (values != 0)], return_counts=True)
+    if len(unknown):
+        worst = int(unknown[counts.argmax()])
+        raise InputError(
+            path,
+            f"{counts.sum()} pixels have labels of no body, most of them {f'#{worst:06x}' if coloured else worst}; the"
+            f" bodies have {', '.join(f'{label} ({name})' for name, label in labels.items())}",
+            "Save the labels as PNG without smoothed edges, or correct `bodies` in capture.yaml",
+        )
+    return numbers
 
 
 def component(

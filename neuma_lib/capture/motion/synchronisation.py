@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from neuma_lib.capture.masks.mattes import numbered
 from neuma_lib.capture.motion.timing import row_times
 from neuma_lib.errors import InputError
 
@@ -67,6 +68,12 @@ def reduced(rgba: np.ndarray, width: int) -> np.ndarray:
     small = np.clip(np.rint(small), 0, 255).astype(np.uint8)
     small[small[..., 3] == 0] = 0
     return small
+
+
+def reduced_labels(labels: np.ndarray, size: tuple[int, int], count: int) -> np.ndarray:
+    """Numbers of bodies (H, W), from 1, in a picture of another width and height, see `numbered`."""
+    shares = (Image.fromarray(255 * (labels == k).astype(np.uint8)) for k in range(1, count + 1))
+    return numbered(np.stack([np.asarray(share.resize(size, Image.Resampling.BOX)) for share in shares]))
 
 
 def reduced_intrinsics(frame: Mapping[str, Any], size: tuple[int, int]) -> dict[str, float]:

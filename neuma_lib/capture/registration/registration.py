@@ -122,6 +122,7 @@ def register(
     scale_known: bool = True,
     progress: Callable[[int, int, float], None] | None = None,
     floor: float | None = None,
+    start: float | None = None,
 ) -> Registration:
     """Estimate pose and motion of a photographed object in its video.
 
@@ -135,11 +136,17 @@ def register(
             correct within a factor of about 1.5.
         progress: called with (step, steps, root mean square residual).
         floor: height [m]. Frames in which the object would be below it, after the contact, are omitted. None: no floor.
+        start: time of the pose [s], when several bodies are all in flight. None: `first_common`.
 
     Raises:
-        InputError: the cameras have no common time. `check_overlap` refuses an object that matches in no pose.
+        InputError: the cameras have no common time, or it ends before ``start``. `check_overlap` refuses an object that
+            matches in no pose.
     """
-    start = first_common(sights, name)
+    start = first_common(sights, name) if start is None else start
+    early = start - min(sight.clock[-1] for sight in sights)
+    if early > 0:
+        problem = f"its free flight ends {1000 * early:.0f} ms before that of another body begins"
+        raise InputError(name, problem, "Release the bodies at the same time")
     parabola = parabola.at(start)
     pivot = mass @ particles / mass.sum()
     inertia = moment_of_inertia(particles - pivot, mass)

@@ -47,6 +47,7 @@ class Sight:
     K: np.ndarray
     offset: float = 0.0  # offset of its times to the clock of the first camera [s]
     offset_known: bool = True  # whether the offset is exact
+    hidden: np.ndarray | None = None  # pixels that show another body, (T, H, W), None without others
 
     @property
     def clock(self) -> np.ndarray:
@@ -56,7 +57,8 @@ class Sight:
     def select(self, keep: Sequence[int]) -> "Sight":
         """The frames with the given indices."""
         keep = list(keep)
-        return replace(self, times=self.times[keep], images=self.images[keep])
+        hidden = None if self.hidden is None else self.hidden[keep]
+        return replace(self, times=self.times[keep], images=self.images[keep], hidden=hidden)
 
     def boxes(self) -> np.ndarray:
         """Left, upper, right and lower bound of the mask of each frame [px], (T, 4)."""
@@ -151,9 +153,10 @@ class Pictures:
         self.gains, self.weights = np.ones((self.cameras, 3)), np.ones(self.cameras)
         images, valid, Ks, blur, spacing = [], [], [], [], []
         for sight, factor, distance in zip(sights, factors, distances, strict=True):
-            for image, box in zip(sight.images, sight.boxes(), strict=True):
+            unknown = np.zeros(len(sight.images), bool) if sight.hidden is None else sight.hidden
+            for image, box, hidden in zip(sight.images, sight.boxes(), unknown, strict=True):
                 corner = np.round((box[:2] + box[2:] - self.side * factor) / 2).astype(int)
-                crop, inside = _crop(image, corner, self.side, factor)
+                crop, inside = _crop(image, corner, self.side, factor, hidden)
                 K = sight.K.copy()
                 K[:2, 2] -= corner
                 K[:2] /= factor
@@ -381,9 +384,12 @@ class Pictures:
         return images * torch.cat([factors, torch.ones(len(factors), 1)], dim=1)[:, None, None]
 
 
-def _crop(image: np.ndarray, corner: np.ndarray, side: int, factor: int) -> tuple[Tensor, Tensor]:
+def _crop(
+    image: np.ndarray, corner: np.ndarray, side: int, factor: int, hidden: np.ndarray
+) -> tuple[Tensor, Tensor]:
     """Colours over black and coverage (side, side, 4) of a square crop of straight-alpha RGBA (H, W, 4), uint8,
-    averaged over squares of ``factor`` pixels, and a mask (side, side) of squares within the image."""
+    averaged over squares of ``factor`` pixels, and a mask (side, side) of squares within the image that show no other
+    body. ``hidden`` are the pixels that do, (H, W) or ()."""
     height, width = image.shape[:2]
     whole = np.zeros((side * factor, side * factor, 5), np.float32)
     (x0, y0), (x1, y1) = np.maximum(corner, 0), np.minimum(corner + side * factor, (width, height))
@@ -391,7 +397,7 @@ def _crop(image: np.ndarray, corner: np.ndarray, side: int, factor: int) -> tupl
         part = image[y0:y1, x0:x1].astype(np.float32) / 255
         part[..., :3] *= part[..., 3:]
         to = np.s_[y0 - corner[1] : y1 - corner[1], x0 - corner[0] : x1 - corner[0]]
-        whole[to][..., :4], whole[to][..., 4] = part, 1
+        whole[to][..., :4], whole[to][..., 4] = part, ~(hidden[y0:y1, x0:x1] if hidden.ndim else hidden)
     small = whole.reshape(side, factor, side, factor, 5).mean(axis=(1, 3))
     inside = (small[..., 4] > 0.999).astype(np.float32)
     return torch.from_numpy(small[..., :4].copy()), torch.from_numpy(inside)
