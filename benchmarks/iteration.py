@@ -293,7 +293,8 @@ def report(scene: BenchmarkScene, device: torch.device, batch: int) -> list[str]
     rate, peak = bandwidth(device), arithmetic(device)
     parts = [*simulation_parts(scene, device), *rendering_parts(scene, device, batch)]
     simulation = seconds(lambda: simulate_and_back(scene), device)
-    bounded = seconds(lambda: simulate_and_back(scene, memory=memory_of_states(size) / 2), device, 3)
+    states = 4.0 * 24 * size.particles * (size.steps + 1)  # bytes, of all steps
+    bounded = seconds(lambda: simulate_and_back(scene, memory=states / 2), device, 3)
     free_pool()  # so that the peak is that of training alone
     times = []
     memory = peak_memory(lambda: times.extend(iterations(scene, 8)), device)
@@ -332,11 +333,6 @@ def report(scene: BenchmarkScene, device: torch.device, batch: int) -> list[str]
         f"{slow / fast:.0f} |",
     ]
     return lines
-
-
-def memory_of_states(size: Size) -> float:
-    """Bytes of the states of all steps."""
-    return 4.0 * 24 * size.particles * (size.steps + 1)
 
 
 if __name__ == "__main__":

@@ -324,9 +324,6 @@ class Material:
             return [measure(chosen[0]) - float(np.mean([measure(fit) for fit in launches]))]
         return []
 
-    def over_best(self) -> list[float]:
-        return [log_std(self.fits[0]) - min(map(log_std, self.fits))] if self.fits else []
-
     def experiments(self, choose: bool) -> list[int]:
         """Number of experiments until all constants are determined, `EXPERIMENTS` + 1 if they are not."""
         rounds = self.rounds[choose]
@@ -392,7 +389,7 @@ def page(materials: Sequence[Material], command: str) -> str:
         logs = [value for each in some for value in each.over_random(measure, *kinds)]
         return f"{math.exp(np.mean(logs)):.2f}" if logs else ""
 
-    best = [value for each in materials for value in each.over_best()]
+    best = [log_std(each.fits[0]) - min(map(log_std, each.fits)) for each in materials if each.fits]
     rows = [
         ["std, chosen experiment over random launches", "0.6", ratio(log_std, materials)],
         ["std, chosen launch over random launches", "0.6", ratio(log_std, materials, "launch", "turned")],

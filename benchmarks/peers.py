@@ -196,9 +196,8 @@ def compare(case: Case, engines: Sequence[Child], rounds: int, clock: int = 0) -
         lines.append(f"  {engine.name}: positions differ by {distance:.1e} m, {gradients}")
         if not agree(distance, error, engine.peer):
             limits = f"at most {engine.peer.distance:g} m and {MAX_GRADIENT_ERROR:g}"
-            raise RuntimeError(
-                "\n".join([*lines, f"not the same simulation, which needs {limits}: no times"])
-            )
+            problem = "\n".join([*lines, f"not the same simulation, which needs {limits}: no times"])
+            raise RuntimeError(problem)
     return "\n".join([*lines, table(interleaved(engines, rounds), case.steps, clock)])
 
 

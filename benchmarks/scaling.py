@@ -8,7 +8,6 @@ grid and steps are measured on simulation and networks alone, frames and resolut
 scaling.csv and scaling.png, and prints the exponent p of time ~ size^p between the two largest sizes.
 """
 
-import csv
 import dataclasses
 import gc
 import math
@@ -19,6 +18,8 @@ import torch
 from benchmarks.iteration import iterations, simulate_and_back
 from benchmarks.scene import SMALL, Size, make_scene
 from benchmarks.timing import device_name, parser_of, peak_memory, seconds
+from neuma_lib.evaluation.text_tables import as_csv
+from neuma_lib.io.files import write_text
 from neuma_lib.sim.workspace import free_pool
 
 SWEEPS = {
@@ -140,11 +141,7 @@ def main() -> None:
             free_memory(device)
             rows.append({"axis": axis, "size": value, "seconds": time, "bytes": peak})
             print(f"| {UNITS[axis]} | {value} | {1e3 * time:.1f} | {peak / 2**30:.2f} |", flush=True)
-    args.output.mkdir(parents=True, exist_ok=True)
-    with open(args.output / "scaling.csv", "w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0].keys(), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    write_text(args.output / "scaling.csv", as_csv([rows[0], *(row.values() for row in rows)]))
     title = f"{device_name(device)}; others: {base.particles} particles, {base.grid}³, {base.steps} steps"
     draw(rows, args.output / "scaling.png", title)
     for axis in args.axes:

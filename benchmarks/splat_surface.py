@@ -48,8 +48,7 @@ def bowl() -> trimesh.Trimesh:
 
 def pot() -> trimesh.Trimesh:
     """A pot that is open upwards, 0.3 m wide and 0.4 m high, its wall 0.02 m thick."""
-    profile = [(0, 0), (0.15, 0), (0.15, 0.4), (0.13, 0.4), (0.13, 0.02), (0, 0.02)]
-    return upright(profile)
+    return upright([(0, 0), (0.15, 0), (0.15, 0.4), (0.13, 0.4), (0.13, 0.02), (0, 0.02)])
 
 
 def upright(profile: list[tuple[float, float]]) -> trimesh.Trimesh:

@@ -17,9 +17,8 @@ def _inside(name: str) -> str:
     if not name.strip() or not name.isprintable():
         raise ValueError("expected the name of a file or folder")
     if plain.is_absolute() or PureWindowsPath(name).drive or ".." in plain.parts or name.startswith("~"):
-        raise ValueError(
-            "the path must be relative and inside the folder of the capture. Copy the file there"
-        )
+        problem = "the path must be relative and inside the folder of the capture. Copy the file there"
+        raise ValueError(problem)
     return name
 
 
@@ -171,15 +170,13 @@ class CaptureConfig(Section):
     @model_validator(mode="after")
     def _metres_from_somewhere(self) -> "CaptureConfig":
         if self.board is None and self.poses == "board":
-            raise ValueError(
-                "poses: board needs `board: {square: ...}` with the measured side of a square [m]"
-            )
+            problem = "poses: board needs `board: {square: ...}` with the measured side of a square [m]"
+            raise ValueError(problem)
         if self.board is not None and self.length is not None:
             raise ValueError("length: the board already defines the scale; give one of the two")
         if self.center is not None and (self.board is None or self.poses not in ("photographs", "board")):
-            raise ValueError(
-                "center: it is a point in the frame of the board, which is not used here; leave it out"
-            )
+            problem = "center: it is a point in the frame of the board, which is not used here; leave it out"
+            raise ValueError(problem)
         if len(self.bodies) not in (0, *range(2, MAX_BODIES + 1)):
             raise ValueError(f"bodies: {len(self.bodies)} must be 2 to {MAX_BODIES}")
         labels = [str(body.label).lower() for body in self.bodies.values()]
@@ -194,9 +191,8 @@ class CaptureConfig(Section):
             raise ValueError("object, density: of one body only; `bodies` have labels and densities instead")
         for name, mark in self.object.items():
             if len(mark) == 4 and (mark[2] - mark[0] < 8 or mark[3] - mark[1] < 8):
-                raise ValueError(
-                    f"object.{name}: expected [left, upper, right, lower] in pixels, 8 apart or more"
-                )
+                problem = f"object.{name}: expected [left, upper, right, lower] in pixels, 8 apart or more"
+                raise ValueError(problem)
         if self.poses == "board" and self.lens is None:
             raise ValueError("poses: board needs `lens`, a file with the intrinsics of the cameras")
         return self

@@ -35,9 +35,8 @@ class BodyConfig(Section):
             key for key in ("size", "height", "center", "velocity", "spin") if getattr(self, key) is not None
         ]
         if self.shape is None and placed:
-            raise ValueError(
-                f"{', '.join(placed)}: a reconstructed object starts as in its scene; give a shape"
-            )
+            problem = f"{', '.join(placed)}: a reconstructed object starts as in its scene; give a shape"
+            raise ValueError(problem)
         return self
 
 

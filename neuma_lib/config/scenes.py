@@ -212,9 +212,8 @@ class SceneConfig(Section):
             if self.captured is None and getattr(self, key) is None and unknown.get(key, ...) is not None:
                 raise ValueError(f"{key}: null is for scenes of captures only; give a value")
         if self.splat and self.captured:
-            raise ValueError(
-                "splat: this scene is one of a capture; give the scene of the splat another name"
-            )
+            problem = "splat: this scene is one of a capture; give the scene of the splat another name"
+            raise ValueError(problem)
         return self
 
     @model_validator(mode="after")

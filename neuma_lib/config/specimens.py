@@ -45,9 +45,8 @@ class SpecimenConfig(Section):
         parts = self.law.plain().values()
         known = {key for part in parts for key in part} - {"name"}
         if wrong := [name for name in self.fitted if name not in known]:
-            raise ValueError(
-                f"fitted: {wrong[0]} is not a constant of the law, which has {', '.join(sorted(known))}"
-            )
+            problem = f"fitted: {wrong[0]} is not a constant of the law, which has {', '.join(sorted(known))}"
+            raise ValueError(problem)
         if min(self.cells) < 2:
             raise ValueError(f"cells: {min(self.cells)} along the height must be at least 2")
         return self

@@ -54,9 +54,8 @@ def unpacked(elements: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     if "sh" in elements:
         columns = elements["sh"].dtype.names
         if len(columns) not in REST_COUNTS or len(elements["sh"]) != len(rows):
-            raise ValueError(
-                f"{len(columns)} coefficients of {len(elements['sh'])} Gaussians, not {len(rows)}"
-            )
+            problem = f"{len(columns)} coefficients of {len(elements['sh'])} Gaussians, not {len(rows)}"
+            raise ValueError(problem)
         rest = np.stack([elements["sh"][f"f_rest_{i}"] for i in range(len(columns))], axis=1)
         rest = rest * (_SH_RANGE / 255) - _SH_RANGE / 2
     arrays = {

@@ -68,7 +68,7 @@ class ProjectCase(Case):
         return f"{paths.results_root(self.settings)}/{self.moved}/{self.folder}/rollout.h5"
 
     def product(self) -> str:
-        run = f"{self._folder(self.scene)}/{self.name}"
+        run = f"{replicate_folder(*self.settings.replicate(self.scene), self.seeds())}/{self.name}"
         return f"{paths.results_root(self.settings)}/{run}/{self.method.product}"
 
     def prior_file(self) -> str:
@@ -102,10 +102,6 @@ class ProjectCase(Case):
     def seeds(self) -> tuple[str, ...]:
         """Seeds of a replicate that change the results."""
         return tuple(name for name in SEEDS if name in self.method.seeds(self))
-
-    def _folder(self, scene: str) -> str:
-        base, seeds = self.settings.replicate(scene)
-        return replicate_folder(base, seeds, self.seeds())
 
     def density(self, scene: str) -> float | dict[str, Any]:
         """Density that the method assumes for the body of a scene [kg/m^3]."""

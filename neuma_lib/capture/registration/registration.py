@@ -207,7 +207,7 @@ def register(
     covariance += _spread(best, others)
     ratio, other = min(others, key=lambda each: each[0], default=(None, None))
     before = replace(best, motion=motion, enlargement=0.0)
-    result = Registration(
+    return Registration(
         names=tuple(sight.name for sight in sights),
         start=start,
         pivot=pivot,
@@ -224,7 +224,6 @@ def register(
         axes=sights[0].viewmat[:3, :3],
         comparisons=pictures.comparisons(render(pictures, best, start), _COMPARISONS),
     )
-    return result
 
 
 def _near_frames(times: np.ndarray, stage: Stage, interval: float) -> np.ndarray:
