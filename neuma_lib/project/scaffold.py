@@ -61,6 +61,7 @@ prior: jelly              # material that a method starts from: jelly, plasticin
 density: 1000             # mass over volume [kg/m^3], from a kitchen scale
 
 # object: {{a.jpg: [268, 115, 775, 625]}}   # a box [px], if other objects are around: neuma select captures/{name}
+# bodies: {{clay: {{label: 1}}, gum: {{label: 2}}}}    # several bodies, by their labels in own masks (no density above)
 # center: [0.09, 0.12]    # point on the floor below the object, from the lower left corner of the squares [m]
 # scale: 2.0              # metres of the simulator to a metre of the room, for objects of about 10 cm
 # held_out: [two]         # falls that are predicted and not learned from

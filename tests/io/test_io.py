@@ -16,7 +16,7 @@ from neuma_lib.io.gaussians import load_gaussians, save_gaussians
 from neuma_lib.io.hdf5 import read_arrays, write_arrays
 from neuma_lib.io.images import list_body, load_observation, read_hidden, read_image_set, write_transforms
 from neuma_lib.io.mesh import read_mesh, write_mesh
-from neuma_lib.io.particles import with_motion
+from neuma_lib.io.particles import with_motion, with_motions
 from neuma_lib.io.ply import read_ply, write_ply
 from neuma_lib.io.weights import read_weights, write_weights
 from neuma_lib.splatting.gaussians import Gaussians
@@ -446,3 +446,17 @@ def test_the_start_of_identified_json_is_an_initial_motion_like_velocity_json(tm
     write_json(tmp_path / "identified.json", {"law": {}, "start": motion})
     one, other = (with_motion(body, tmp_path / f"{name}.json") for name in ("velocity", "identified"))
     assert torch.equal(one.v, other.v) and torch.equal(one.C, other.C) and one.C.any()
+
+
+def test_bodies_that_touch_start_from_their_identification(tmp_path):
+    bodies = [ball(height=0.28, count=20), ball(height=0.6, count=30)]
+    motions = [
+        {"name": name, "v0": [k, 0.0, 0.0], "angular_velocity": [0.0, 0.0, 0.0], "centre": [0.5, y, 0.5]}
+        for name, k, y in (("clay", 1.0, 0.28), ("gum", -2.0, 0.6))
+    ]
+    write_json(tmp_path / "identified.json", {"start": {"bodies": motions, "separate": True}})
+    state = with_motions(bodies, tmp_path / "identified.json")
+    first, second = state.v.split(state.bodies)
+    assert state.bodies == tuple(len(body.x0) for body in bodies)
+    assert (first[:, 0] == 1.0).all() and (second[:, 0] == -2.0).all()
+    torch.testing.assert_close(state.x, torch.cat([body.x0 for body in bodies]))
