@@ -38,6 +38,7 @@ MADE_BY = {
     "identified": "results/identified.csv",
     "identified_table1_converged": "results/identified_table1_converged.csv",
     "calibration": "calibration",
+    "piles": "results/piles.csv",
     "table1_systems": "results/table1_systems.csv",
     "table2_systems": "results/table2_systems.csv",
 }
