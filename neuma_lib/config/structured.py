@@ -22,10 +22,6 @@ class StructuredConfig(Section):
     margin: float = internal(
         0.05, "relative decrease of the held-out loss required to correct a part of the law", ge=0
     )
-    corrected: str | None = internal(
-        None,
-        "one of several bodies, whose law is corrected in their video with the identified laws of the others",
-    )
     rivals: int = internal(
         1, "number of tied families with another return map that are corrected for comparison", ge=0
     )

@@ -50,6 +50,24 @@ MIN_FRAMES = 4
 """Minimum number of frames for fit and evaluation."""
 
 
+@dataclass(frozen=True)
+class Alternative:
+    """A law that may be corrected in place of the first one.
+
+    Attributes:
+        law: analytic law with an adaptor that is zero.
+        name: prefix of its trials.
+        surrounded: as in `train_material`.
+        rival: whether it also replaces an identified law, so that the held-out loss must decrease by another margin.
+            False for the law of another body.
+    """
+
+    law: StructuredLaw
+    name: str
+    surrounded: Surrounded = alone
+    rival: bool = True
+
+
 @dataclass
 class Score:
     """Losses of a choice of parts.
@@ -69,16 +87,18 @@ class Selection:
 
     Attributes:
         parts: short names of the corrected parts, empty if the law is unchanged.
-        base: index of the corrected law: 0, or k for the k-th rival.
-        trials: scores by names of the parts joined with " + ", and of `NOTHING`. Names of the k-th rival have the
-            prefix "rival k: ".
+        trials: scores by names of the parts joined with " + ", after the name of the law if it has one, and of
+            `NOTHING`.
         held_out_frames: steps of the held-out frames, one tuple per video.
+        base: index of the corrected law: 0, or k for the k-th alternative.
+        name: name of the corrected law.
     """
 
     parts: tuple[str, ...]
     trials: dict[str, Score]
     held_out_frames: tuple[tuple[int, ...], ...]
     base: int = 0
+    name: str = ""
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for JSON, with None for an infinite loss."""
@@ -87,7 +107,7 @@ class Selection:
             for name, losses in _plain(self.trials).items()
         }
         held_out = [list(frames) for frames in self.held_out_frames]
-        about = {"corrected_parts": list(self.parts), "base": self.base}
+        about = {"corrected_parts": list(self.parts), "base": self.base, "name": self.name}
         return {**about, "trials": trials, "held_out_frames": held_out}
 
     def summary(self) -> str:
@@ -98,7 +118,7 @@ class Selection:
             for name, score in self.trials.items()
             if name != NOTHING
         ]
-        return f"corrected: {_name(self.base, self.parts)}; change of the held-out loss: {', '.join(changes)}"
+        return f"corrected: {_name(self.name, self.parts)}; change of the held-out loss: {', '.join(changes)}"
 
 
 def train_structured(
@@ -109,12 +129,13 @@ def train_structured(
     settings: TrainingConfig,
     structured: StructuredConfig,
     *,
-    rivals: Sequence[StructuredLaw] = (),
+    alternatives: Sequence[Alternative] = (),
     other_videos: Sequence[Video] = (),
     checkpoint: Checkpoint | None = None,
     progress: Callable[[int, int, float], None] | None = None,
     log: Callable[[str], None] = print,
     surrounded: Surrounded = alone,
+    name: str = "",
 ) -> tuple[TrainedMaterial, Selection]:
     """Select the parts of a law to correct, and train them in place.
 
@@ -122,10 +143,11 @@ def train_structured(
         model, start, loss, settings, other_videos, surrounded: as in `train_material`.
         law: analytic law with an adaptor that is zero.
         structured: settings of the selection.
-        rivals: laws of other families, one of which replaces ``law`` if its correction has a lower held-out loss.
+        alternatives: laws of other families or bodies, one of which is corrected if its held-out loss is lower.
         checkpoint: file for finished trials and the state of the running training.
         progress: called with (finished iterations, iterations of all trainings, loss).
         log: receives a line for every trial.
+        name: of the law, for several bodies.
 
     Raises:
         InputError: too few frames, and as `train_material`.
@@ -135,8 +157,8 @@ def train_structured(
     if (count := min(len(loss.frames) for _, loss in videos)) < MIN_FRAMES:
         problem = f"{count} must be at least {MIN_FRAMES}, to fit and to evaluate a structured law"
         raise InputError("frames", problem)
-    laws = [law, *rivals]
-    uncorrected = [copy.deepcopy(each.state_dict()) for each in laws]
+    bases = [Alternative(law, name, surrounded, rival=False), *alternatives]
+    uncorrected = [copy.deepcopy(each.law.state_dict()) for each in bases]
     simulated = [_simulate(model, surrounded(law), *video) for video in videos]
     if any(result is None for result in simulated):
         raise NonFiniteError("material", "the simulation with the uncorrected law diverges")
@@ -160,7 +182,7 @@ def train_structured(
     training = [(start, loss.select(keep)) for keep, (start, loss) in zip(fitted, informative, strict=True)]
     brief = settings.model_copy(update={"iterations": structured.trial_iterations})
     first = Stretch(after=settings.iterations)
-    total = len(laws) * brief.iterations + settings.iterations
+    total = len(bases) * brief.iterations + settings.iterations
     saved = checkpoint.load() if checkpoint else None
     trials = {name: Score(**losses) for name, losses in saved["trials"].items()} if saved else {}
     states = dict(saved["states"]) if saved else {}
@@ -174,21 +196,21 @@ def train_structured(
         stretch: Stretch,
         before: int,
     ) -> TrainedMaterial:
-        law = laws[base]
+        law = bases[base].law
         law.load_state_dict(begin)
         for name in trained_parts(law):
             law.parts[PARTS[name]].adaptor.requires_grad_(name in parts)
         inner = checkpoint and _Stage(checkpoint, _plain(trials), dict(states))
         overall = progress and (lambda done, _, value: progress(before + done, total, value))
         options = {"other_videos": videos[1:], "checkpoint": inner, "progress": overall, "log": log}
-        return train_material(
-            model, law, *videos[0], settings, stretch=stretch, surrounded=surrounded, **options
-        )
+        options["surrounded"] = bases[base].surrounded
+        return train_material(model, law, *videos[0], settings, stretch=stretch, **options)
 
     def evaluate(name: str, base: int, state: LawState) -> None:
         """Store the score of a law on the informative frames."""
-        laws[base].load_state_dict(state)
-        results = [_simulate(model, surrounded(laws[base]), *video) for video in informative]
+        bases[base].law.load_state_dict(state)
+        law = bases[base].surrounded(bases[base].law)
+        results = [_simulate(model, law, *video) for video in informative]
         trials[name] = Score(math.inf, math.inf)
         if all(results):
             means = (
@@ -201,24 +223,25 @@ def train_structured(
         if name != NOTHING:
             log(f"{name} corrected: {_compared(trials[name], trials[NOTHING])}")
 
-    candidates = [(base, parts) for base, law in enumerate(laws) for parts in subsets(trained_parts(law))]
-    for base, each in enumerate(laws):
+    candidates = [(k, parts) for k, each in enumerate(bases) for parts in subsets(trained_parts(each.law))]
+    for base, each in enumerate(bases):
         of_base = [parts for k, parts in candidates if k == base]
-        if _name(base, of_base[0]) in trials:
+        if _name(each.name, of_base[0]) in trials:
             continue
         done = base * brief.iterations
-        trained = train(base, uncorrected[base], trained_parts(each), training, brief, first, done)
+        trained = train(base, uncorrected[base], of_base[-1], training, brief, first, done)
         states[base] = {"law": copy.deepcopy(trained.law.state_dict()), "memory": trained.memory}
         if base == 0:
             evaluate(NOTHING, 0, uncorrected[0])
         for parts in of_base:
-            evaluate(_name(base, parts), base, corrected_in(parts, states[base]["law"], uncorrected[base]))
-    base, parts = _select(candidates, trials, structured.margin)
+            state = corrected_in(parts, states[base]["law"], uncorrected[base])
+            evaluate(_name(each.name, parts), base, state)
+    base, parts = _select(candidates, bases, trials, structured.margin)
     steps = tuple(
         tuple(loss.frames[begin + k] for k in out)
         for begin, out, (_, loss) in zip(firsts, held_out, videos, strict=True)
     )
-    selection = Selection(parts, trials, steps, base)
+    selection = Selection(parts, trials, steps, base, bases[base].name)
     if parts:
         begin = corrected_in(parts, states[base]["law"], uncorrected[base])
         last = Stretch(before=brief.iterations, memory=states[base]["memory"])
@@ -285,20 +308,24 @@ def from_frame(start: State, loss: TrajectoryLoss, path: Trajectory, first: int)
 
 
 def _select(
-    candidates: Iterable[tuple[int, tuple[str, ...]]], trials: dict[str, Score], margin: float
+    candidates: Iterable[tuple[int, tuple[str, ...]]],
+    bases: Sequence[Alternative],
+    trials: dict[str, Score],
+    margin: float,
 ) -> tuple[int, tuple[str, ...]]:
     """Base and parts of the lowest held-out loss. Each part, and a rival, must decrease it by the margin."""
 
     def weighted(candidate: tuple[int, tuple[str, ...]]) -> float:
-        base, parts = candidate
-        return trials[_name(base, parts)].held_out_loss * (1 - margin) ** -(len(parts) + (base > 0))
+        k, parts = candidate
+        held_out = trials[_name(bases[k].name, parts)].held_out_loss
+        return held_out * (1 - margin) ** -(len(parts) + bases[k].rival)
 
     return min([(0, ()), *candidates], key=weighted)
 
 
-def _name(base: int, parts: Sequence[str]) -> str:
+def _name(law: str, parts: Sequence[str]) -> str:
     """Name of the trial of a correction."""
-    return (f"rival {base}: " if base else "") + (" + ".join(parts) or NOTHING)
+    return (f"{law}: " if law and parts else "") + (" + ".join(parts) or NOTHING)
 
 
 def _flow(law: Mapping[str, Any]) -> str:

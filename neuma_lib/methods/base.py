@@ -67,8 +67,9 @@ class Case(ABC):
         name: preset or variant whose fit is used, for example ``neuma+rank=4``.
         options: validated, an instance of `Method.Options`.
         evaluate_on: of the preset.
-        together: for a body that moves with others of a scene of several, the file of their common identification and
-            the name of the body in it.
+        together: for a body that moves with others of a scene of several, the case of that scene and the name of the
+            body there.
+        bodies: for a scene of several, the cases of the scenes of its bodies by name.
     """
 
     scene: str
@@ -76,7 +77,8 @@ class Case(ABC):
     name: str
     options: Any
     evaluate_on: EvaluatedOn
-    together: tuple[str, str] | None
+    together: tuple[Case, str] | None
+    bodies: Mapping[str, Case]
 
     @abstractmethod
     def on_moved(self) -> Case:
@@ -124,13 +126,6 @@ class Case(ABC):
     @abstractmethod
     def identified(self) -> str:
         """Name of the file of the law identified in the views of `options`."""
-
-    @abstractmethod
-    def with_others(self) -> tuple[Case, dict[str, Case]]:
-        """The same on the scene of several bodies that this one is of, and on the scene of each of them by name.
-
-        Raises InputError if there is none.
-        """
 
     @abstractmethod
     def each_video(self, choose: Callable[[Case], str]) -> str | list[str]:
@@ -225,6 +220,7 @@ class Method(ABC):
         body_kernels: groups that predictions and renderings with the files of `body_inputs` use in addition.
         draws_module: module with the function `draws`, separate from the method, so that its edits repeat no fit.
         has_law: whether the motion follows from a material law (`MotionModel.law`). Only laws move several bodies.
+        fits_together: whether `fit` also takes a scene of several bodies, in the video of all.
         moves_other_bodies: whether the model moves the bodies of other scenes (``+law_from=``).
     """
 
@@ -238,6 +234,7 @@ class Method(ABC):
     body_kernels: ClassVar[tuple[str, ...]] = ()
     draws_module: ClassVar[str | None] = None
     has_law: ClassVar[bool] = True
+    fits_together: ClassVar[bool] = False
     moves_other_bodies: ClassVar[bool] = True
 
     # ---- planning, without torch

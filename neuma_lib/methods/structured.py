@@ -1,5 +1,7 @@
 """An analytic law and a correction by small networks that keep the structure of a material."""
 
+from collections.abc import Iterator
+
 from neuma_lib.config.motion import WithPrior
 from neuma_lib.config.structured import StructuredConfig
 from neuma_lib.config.training import TrainingConfig
@@ -11,9 +13,9 @@ from neuma_lib.methods.base import (
     Files,
     Method,
     Preset,
-    friction_options,
     training_inputs,
 )
+from neuma_lib.methods.constants import Constants
 
 IDENTIFIED = "identified"
 
@@ -27,6 +29,7 @@ class Structured(Method):
     Options = StructuredOptions
     sections = ("training", "structured")
     product = "adaptor.safetensors"
+    fits_together = True
     draws_module = "neuma_lib.methods.draws"
     presets = {
         "neuma_structured": Preset(
@@ -46,15 +49,18 @@ class Structured(Method):
     }
 
     def fit_inputs(self, case: Case) -> Files:
-        if case.options.corrected is not None:
-            whole, bodies = self._corrected(case)
-            if bodies[case.options.corrected].scene != case.scene:
+        if case.bodies:
+            if case.prior != IDENTIFIED:
                 raise InputError(
-                    f"{case.name} on {case.scene}", "another body is corrected", "Take its scene"
+                    f"{case.name} on {case.scene}",
+                    f"the prior {case.prior} is the law of one body",
+                    f"Use +prior={IDENTIFIED}",
                 )
-            identified = whole.result("identified.json")
-            files = {name: [each.result(file) for each in bodies.values()] for name, file in BODY.items()}
-            video = {"transforms": whole.data("dynamic/transforms.json")}
+            files = {
+                name: [each.result(file) for each in case.bodies.values()] for name, file in BODY.items()
+            }
+            video = {"transforms": case.data("dynamic/transforms.json")}
+            identified = case.result("identified.json")
             return {**files, **video, "velocity": identified, "identified": identified}
         base = {"identified": case.result(case.identified())} if case.prior == IDENTIFIED else {}
         return training_inputs(case) | base
@@ -63,17 +69,12 @@ class Structured(Method):
         return {"base": self._base(case), **super().fit_options(case)}
 
     def model_inputs(self, case: Case) -> Files:
-        if case.options.corrected is not None:
-            whole, bodies = self._corrected(case)
-            adaptor = bodies[case.options.corrected].product()
-            return {"adaptor": adaptor, "identified": whole.result("identified.json")}
+        if case.together:
+            return {"adaptor": case.together[0].product(), **Constants().model_inputs(case)}
         return {"adaptor": case.product()}
 
     def model_options(self, case: Case) -> dict:
-        if case.options.corrected is not None:
-            body = case.together[1] if case.together else case.options.corrected
-            return {"body": body, "corrected": case.options.corrected}
-        return friction_options(case) if case.prior == IDENTIFIED else {}
+        return Constants().model_options(case) if case.prior == IDENTIFIED else {}
 
     def seeds(self, case: Case) -> tuple[str, ...]:
         return (*super().seeds(case), "adaptor")  # of the first layers
@@ -81,7 +82,7 @@ class Structured(Method):
     def fit(self, inputs, options, problem, run):
         from neuma_lib.fitting.families import FRICTION
         from neuma_lib.fitting.identified import recorded_friction
-        from neuma_lib.fitting.structured_fit import rival_bases, train_structured
+        from neuma_lib.fitting.structured_fit import Alternative, rival_bases, train_structured
         from neuma_lib.io.files import read_json
         from neuma_lib.io.laws import save_adaptor
         from neuma_lib.mechanics.analytic import analytic_law
@@ -93,47 +94,48 @@ class Structured(Method):
         options = dict(options)
         base = options.pop("base")
         settings = StructuredOptions(**options)
-        bases, identified, together = [base], {}, {}
-        if not base:
-            identified = read_json(inputs["identified"])
-            if settings.corrected is not None:
-                together, identified = identified, identified["bodies"][settings.corrected]
-            bases = [identified["law"], *rival_bases(identified, settings.rivals)]
-        laws = [
-            structured_law({**each, "form": settings.form}, problem.simulation["dt"], seed=settings.seed)
-            for each in bases
-        ]
-        laws = [law.to(run.device) for law in laws]
-        for law in laws:
-            law.attach_adaptor(settings.rank, settings.alpha, settings.seed)
-        friction = recorded_friction(identified)
-        names = list(together.get("bodies", ()))
+        identified = {} if base else read_json(inputs["identified"])
+        names = list(identified.get("bodies", ()))
         pairs = tuple(
             Pair(*sorted(map(names.index, pair["bodies"])), pair["friction"])
-            for pair in together.get("pairs", ())
+            for pair in identified.get("pairs", ())
         )
+        friction = recorded_friction(identified)
         training = Training(inputs, options, settings, problem, run, {"base": base}, friction, pairs)
+        dt = problem.simulation["dt"]
         others = {
-            name: analytic_law(together["bodies"][name]["law"], problem.simulation["dt"]).to(run.device)
-            for name in names
+            name: analytic_law(identified["bodies"][name]["law"], dt=dt).to(run.device) for name in names
         }
 
-        def surrounded(law):
-            if not together:
-                return law
-            return consecutive([*(others | {settings.corrected: law}).values()], training.counts)
+        def laws_of(name: str) -> Iterator[Alternative]:
+            """The law of a body and its rivals."""
+            own = identified["bodies"][name] if name else identified
+            bases = [base] if base else [own["law"], *rival_bases(own, settings.rivals)]
 
+            def surrounded(law):
+                return consecutive([*(others | {name: law}).values()], training.counts) if name else law
+
+            for k, each in enumerate(bases):
+                law = structured_law({**each, "form": settings.form}, dt, seed=settings.seed).to(run.device)
+                law.attach_adaptor(settings.rank, settings.alpha, settings.seed)
+                title = ", ".join(filter(None, [name, f"rival {k}" if k else ""]))
+                yield Alternative(law, title, surrounded, rival=k > 0)
+
+        alternatives = [(name, each) for name in names or [""] for each in laws_of(name)]
+        first, *rest = (each for _, each in alternatives)
         trained, chosen = train_structured(
-            *training.problem(laws[0]),
+            *training.problem(first.law),
             settings,
-            rivals=laws[1:],
-            surrounded=surrounded,
+            alternatives=rest,
+            surrounded=first.surrounded,
+            name=first.name,
             **training.options(),
         )
         run.log(chosen.summary())
         training.write_history(trained, chosen.as_dict())
         about = {"settings": options, "grid": problem.simulation["grid"], **training.report(trained)}
         about |= {FRICTION: identified[FRICTION]} if friction is not None else {}
+        about |= {"body": alternatives[chosen.base][0]} if names else {}
         save_adaptor(run.product, trained.law, settings.rank, settings.alpha, about)
         training.finish(trained)
 
@@ -141,34 +143,21 @@ class Structured(Method):
         from neuma_lib.fitting.identified import recorded_friction
         from neuma_lib.io.laws import load_law
         from neuma_lib.io.weights import read_weights
-        from neuma_lib.methods.constants import Constants
         from neuma_lib.methods.model import LawOnGrid
 
-        corrected = options.get("corrected")
-        options = {key: value for key, value in options.items() if key != "corrected"}
-        if corrected is not None:
-            identified = Constants().load(inputs, options, dt)
-            if options["body"] != corrected:
-                return identified
-            options["pairs"] = identified.pairs
         about = read_weights(inputs["adaptor"])[1]
+        if options.get("body") is not None:
+            identified = Constants().load(inputs, options, dt)
+            if options["body"] != about["body"]:
+                return identified
+            options = {**options, "pairs": identified.pairs}
         law, friction = load_law(None, inputs["adaptor"], dt), recorded_friction(about)
         return LawOnGrid(law, stable=about["stable"], friction=friction, **options)
 
     def uncertainty_inputs(self, case: Case) -> Files:
-        if case.prior != IDENTIFIED or case.options.corrected is not None:
+        if case.prior != IDENTIFIED or case.together:
             return {}
         return {"identified": case.result(case.identified()), "rollout": case.rollout()}
-
-    @staticmethod
-    def _corrected(case: Case) -> tuple[Case, dict[str, Case]]:
-        """`Case.with_others` with the corrected body. Raises InputError if it is none of them."""
-        whole, bodies = case.with_others()
-        if case.prior != IDENTIFIED or case.options.corrected not in bodies:
-            problem = f"corrected = {case.options.corrected} with the prior {case.prior}"
-            remedy = f"Give one of {', '.join(bodies)}, and the prior {IDENTIFIED}"
-            raise InputError(f"{case.name} on {case.scene}", problem, remedy)
-        return whole, bodies
 
     def _base(self, case: Case) -> dict | None:
         """The analytic law of the prior, or None for the law identified in the video."""

@@ -33,7 +33,7 @@ class ProjectCase(Case):
     options: Any
     evaluate_on: str
     method: Method
-    together: tuple[str, str] | None = None
+    together: tuple[Case, str] | None = None
 
     def on_moved(self) -> "ProjectCase":
         return replace(self, scene=self.moved)
@@ -80,14 +80,14 @@ class ProjectCase(Case):
             return "identified.json"
         return f"identified+views={','.join(map(str, views))}.json"
 
-    def with_others(self) -> tuple[Case, dict[str, Case]]:
-        base, seeds = self.settings.replicate(self.scene)
-        if (part := self.settings.scenes[base].part_of) is None:
-            problem = "it is none of several bodies in one video"
-            raise InputError(f"{self.scene}/{self.name}", problem, "Leave out `corrected`")
-        whole = replicate_folder(part[0], seeds)
-        scenes = zip(self.settings.scenes[part[0]].bodies, self.settings.body_scenes(whole), strict=True)
-        return replace(self, scene=whole), {name: replace(self, scene=scene) for name, scene in scenes}
+    @property
+    def bodies(self) -> dict[str, Case]:
+        base, _ = self.settings.replicate(self.scene)
+        scenes = self.settings.body_scenes(self.scene)
+        return {
+            name: replace(self, scene=scene)
+            for name, scene in zip(self.settings.scenes[base].bodies, scenes, strict=False)
+        }
 
     def each_video(self, choose: Callable[[Case], str]) -> str | list[str]:
         scenes = self.settings.video_scenes(self.scene)
@@ -111,9 +111,8 @@ class ProjectCase(Case):
     @property
     def densities(self) -> list[float | dict[str, Any]]:
         """The same for all bodies of a fit."""
-        if getattr(self.options, "corrected", None):
-            return [self.density(each.scene) for each in self.with_others()[1].values()]
-        return [self.density(scene) for scene in self.settings.video_scenes(self.scene)]
+        videos = self.settings.video_scenes(self.scene)
+        return [self.density(scene) for video in videos for scene in self.settings.body_scenes(video)]
 
     @property
     def learned_from_moved_scene(self) -> bool:
@@ -202,17 +201,18 @@ def law_from(settings: Config, method: str) -> str | None:
     return source
 
 
-def case(settings: Config, scene: str, method: str) -> ProjectCase:
+def case(settings: Config, scene: str, method: str, fit: bool = False) -> ProjectCase:
     """A preset or variant on a scene.
 
     Args:
         scene: folder of the scene, with the seeds of its replicate.
+        fit: admit a scene of several bodies if the method is fitted to all of them together.
 
     Raises:
         InputError: unknown names, options that do not fit.
     """
     chosen, _ = preset(settings, method)
-    if settings.scene(scene).bodies:
+    if settings.scene(scene).bodies and not (fit and kind_of(settings, method).fits_together):
         problem = "it has several bodies, and a model is of one"
         raise InputError(
             f"{scene}/{method}", problem, f"Take the scenes {', '.join(settings.body_scenes(scene))}"
@@ -272,9 +272,13 @@ def body_cases(settings: Config, column: str, method: str) -> list[ProjectCase]:
     cases = [case(settings, scene, method) for scene in settings.body_scenes(column)]
     pile, names = settings.touching_bodies(column)
     base, seeds = settings.replicate(column)
-    if pile and not (base in settings.scenes and settings.scenes[base].part_of):
-        file = paths.result_path(settings, replicate_folder(pile, seeds), "identified.json")
-        cases = [replace(each, together=(file, name)) for each, name in zip(cases, names, strict=True)]
+    own = all(each.scene == each.moved for each in cases)  # not the law of another scene
+    if pile and own and not (base in settings.scenes and settings.scenes[base].part_of):
+        whole = replicate_folder(pile, seeds)
+        cases = [
+            replace(each, together=(replace(each, scene=whole, moved=whole), name))
+            for each, name in zip(cases, names, strict=True)
+        ]
     if len(cases) > 1 and not cases[0].method.has_law:
         problem = "it has no material law, so that it cannot move several bodies together"
         raise InputError(f"{column}/{method}", problem)

@@ -12,6 +12,7 @@ from neuma_lib.coupling.bodies import join
 from neuma_lib.fitting.frame_batches import first_contact, held_out_frames
 from neuma_lib.fitting.material import ParticleLoss, PixelLoss, Stretch, train_material
 from neuma_lib.fitting.structured_fit import (
+    Alternative,
     Score,
     _select,
     first_informative_frame,
@@ -55,7 +56,7 @@ def fit(problem, *specs, settings=SETTINGS, structured=STRUCTURED, **options):
     laws = [structured_law(spec, MODEL.dt).double() for spec in specs]
     for law in laws:
         law.attach_adaptor(rank=settings.rank)
-    options["rivals"] = laws[1:]
+    options["alternatives"] = [Alternative(law, f"rival {k}") for k, law in enumerate(laws[1:], 1)]
     return train_structured(MODEL, laws[0], body.state(V0), loss, settings, structured, **options)
 
 
@@ -200,7 +201,8 @@ def test_each_part_has_to_gain_the_margin():
     def chosen(elastic, plastic, both, margin=0.1):
         losses = {"nothing": 1.0, "elastic": elastic, "plastic": plastic, "elastic + plastic": both}
         trials = {name: Score(0.0, loss) for name, loss in losses.items()}
-        base, parts = _select([(0, parts) for parts in subsets(("elastic", "plastic"))], trials, margin)
+        candidates = [(0, parts) for parts in subsets(("elastic", "plastic"))]
+        base, parts = _select(candidates, [Alternative(None, "", rival=False)], trials, margin)
         assert base == 0
         return parts
 
@@ -252,9 +254,10 @@ def test_an_interrupted_run_with_a_rival_resumes(problem, saves):
 def test_a_rival_has_to_gain_the_margin_too():
     trials = {"nothing": Score(0.0, 1.0), "elastic": Score(0.0, 0.8), "rival 1: elastic": Score(0.0, 0.73)}
     candidates = [(0, ("elastic",)), (1, ("elastic",))]
-    assert _select(candidates, trials, 0.1) == (0, ("elastic",))
+    bases = [Alternative(None, "", rival=False), Alternative(None, "rival 1")]
+    assert _select(candidates, bases, trials, 0.1) == (0, ("elastic",))
     trials["rival 1: elastic"] = Score(0.0, 0.71)
-    assert _select(candidates, trials, 0.1) == (1, ("elastic",))
+    assert _select(candidates, bases, trials, 0.1) == (1, ("elastic",))
 
 
 def test_rivals_are_ties_with_other_return_maps_the_best_first():
@@ -355,6 +358,9 @@ def test_too_few_frames(problem):
         fit((body, loss.select([0, 1, 2])), TRUTH)
 
 
+BLOCK = {"elasticity": {"name": "hencky", "E": 1e5, "nu": 0.3}}
+
+
 @pytest.fixture(scope="module")
 def next_to_a_block():
     """A ball that falls on a sliding block, whose law is known: model, start, loss, and the laws from the ball's."""
@@ -362,7 +368,7 @@ def next_to_a_block():
     velocities = [(0.8, -0.4, 0.0), (0.0, -1.5, 0.0)]
     start = State.joined([body.state(v) for body, v in zip(bodies, velocities, strict=True)], separate=True)
     model, frames = replace(MODEL, pairs=(Pair(0, 1, 0.3),)), tuple(range(0, 121, 12))
-    known = analytic_law({"elasticity": {"name": "hencky", "E": 1e5, "nu": 0.3}}, model.dt)
+    known = analytic_law(BLOCK, model.dt)
     true, cameras = analytic_law(TRUTH, model.dt), camera()
 
     def surrounded(law):
@@ -374,15 +380,33 @@ def next_to_a_block():
     return model, start, PixelLoss(join(bodies), Observation(frames, images, cameras)), surrounded
 
 
-def test_one_body_is_corrected_next_to_another(next_to_a_block):
+@pytest.mark.parametrize("order", [("ball", "block"), ("block", "ball")])
+def test_the_body_whose_law_is_wrong_is_corrected(next_to_a_block, order):
     """The ball touches the block only, so that its frames before the block touches the floor are not left out."""
-    model, start, loss, surrounded = next_to_a_block
-    law = structured_law(FLOWS, MODEL.dt).double()
-    law.attach_adaptor(rank=None)
-    options = {"surrounded": surrounded, "log": lambda _: None}
-    trained, choice = train_structured(model, law, start, loss, SETTINGS, STRUCTURED, **options)
-    assert choice.parts == ("elastic",)
-    assert choice.trials["elastic"].held_out_loss < 0.9 * choice.trials["nothing"].held_out_loss
+    model, start, loss, around = next_to_a_block
+
+    def with_ball(law):
+        return consecutive([law, analytic_law(FLOWS, model.dt).double()], [300, 300])
+
+    specs, others = {"ball": FLOWS, "block": BLOCK}, {"ball": around, "block": with_ball}
+    bases = [
+        Alternative(structured_law(specs[name], model.dt).double(), name, others[name], False)
+        for name in order
+    ]
+    for base in bases:
+        base.law.attach_adaptor(rank=None)
+    first, other = bases
+    options = {"surrounded": first.surrounded, "name": first.name, "log": lambda _: None}
+    trained, choice = train_structured(
+        model, first.law, start, loss, SETTINGS, STRUCTURED, alternatives=[other], **options
+    )
+    trials = {name: score.held_out_loss for name, score in choice.trials.items()}
+    assert (choice.name, choice.parts) == ("ball", ("elastic",)) and choice.base == order.index("ball")
+    assert choice.summary().startswith("corrected: ball: elastic;")
+    assert (
+        trials["ball: elastic"] < 0.9 * trials["nothing"]
+        and trials["block: elastic"] > trials["ball: elastic"]
+    )
     assert trained.best_loss < 0.9 * trained.history.loss[0]
     assert any(bool(p.any()) for p in deltas(trained.law, "elasticity"))
     assert len(choice.held_out_frames[0]) == 2 and choice.held_out_frames[0][-1] == 120

@@ -105,8 +105,8 @@ def test_files_of_a_pile_for_the_viewer(with_pile):
     (run,) = files.runs
     assert run.law is None and run.gaussian_motion == "affine"
     bodies = body_cases(with_pile(), "Pile", "constants")
-    assert [body.together for body in bodies] == [
-        ("results/Pile/identified.json", name) for name in PILE["bodies"]
-    ]
+    assert [
+        (whole.result("identified.json"), name) for whole, name in (body.together for body in bodies)
+    ] == [("results/Pile/identified.json", name) for name in PILE["bodies"]]
     (alone,) = body_cases(with_pile(), "Pile_duck", "constants")
     assert alone.together is None

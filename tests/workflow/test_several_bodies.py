@@ -67,30 +67,43 @@ def test_bodies_together_and_one_alone_share_the_cores(project):
 
 
 def test_a_pile_has_no_fit_of_one_law(project):
-    refused = project.run("--dry-run", *CHANGES, f"{RESULTS}/Pile/neuma/adaptor.safetensors", succeeds=False)
-    assert "Pile_fish, Pile_duck, Pile_ball" in refused and "Traceback (most recent call last)" not in refused
+    for method, file in (("neuma", "adaptor.safetensors"), ("neuma_structured", "image_metrics.json")):
+        target = f"{RESULTS}/Pile/{method}/{file}"
+        refused = project.run("--dry-run", *CHANGES, target, succeeds=False)
+        assert (
+            "Pile_fish, Pile_duck, Pile_ball" in refused
+            and "Traceback (most recent call last)" not in refused
+        )
 
 
-def test_the_law_of_one_body_is_corrected_in_the_video_of_all(project):
-    """With the identified laws of the others, in the fit and in the prediction."""
-    method = "neuma_structured+corrected=duck"
-    plan = project.plan(*CHANGES, f"{RESULTS}/Pile/{method}/metrics.json")
-    fit, evaluated = plan.one("fit_structured"), plan.one("evaluate")
-    product, identified = (
-        f"{RESULTS}/Pile_duck/{method}/adaptor.safetensors",
-        f"{RESULTS}/Pile/identified.json",
+def test_laws_are_corrected_in_the_video_of_all(project):
+    """In the fit and in predictions: of all, without one, and of one alone, which has its own."""
+    method = "neuma_structured"
+    plan = project.plan(
+        *CHANGES,
+        f"{RESULTS}/Pile/{method}/metrics.json",
+        f"{RESULTS}/experiments/without/{method}/metrics.json",
+        f"{RESULTS}/Pile_duck/{method}/metrics.json",
     )
-    assert fit.outputs[0] == product
+    fits = {job.outputs[0]: {*job.inputs} for job in plan.of_rule("fit_structured")}
+    product, alone = (f"{RESULTS}/{scene}/{method}/adaptor.safetensors" for scene in ("Pile", "Pile_duck"))
+    identified = f"{RESULTS}/Pile/identified.json"
+    assert set(fits) == {product, alone}
     particles = {f"{RESULTS}/Pile_{name}/particles.h5" for name in NAMES}
-    assert {f"{DATA}/Pile/dynamic/transforms.json", identified, *particles} <= {*fit.inputs}
-    assert {product, identified} <= {*evaluated.inputs} and not plan["identify"]
-    for scene, body, problem in (
-        ("Pile_fish", "duck", "another body is corrected"),
-        ("Pile_fish", "cat", "Give one of fish, duck, ball"),
-        ("BouncyBall", "duck", "none of several bodies"),
-    ):
-        target = f"{RESULTS}/{scene}/neuma_structured+corrected={body}/adaptor.safetensors"
-        assert problem in project.run("--dry-run", *CHANGES, target, succeeds=False)
+    assert {f"{DATA}/Pile/dynamic/transforms.json", identified, *particles} <= fits[product]
+    assert particles & fits[alone] == {f"{RESULTS}/Pile_duck/particles.h5"} and identified not in fits[alone]
+    evaluated = {job.outputs[1]: {*job.inputs} for job in plan.of_rule("evaluate")}
+    for column, file in (("Pile", product), ("experiments/without", product), ("Pile_duck", alone)):
+        inputs = evaluated[f"{RESULTS}/{column}/{method}/metrics.json"]
+        assert {product, alone} & inputs == {file} and (identified in inputs) == (file == product)
+    target = f"{RESULTS}/Pile/{method}+prior=jelly/adaptor.safetensors"
+    assert "Use +prior=identified" in project.run("--dry-run", *CHANGES, target, succeeds=False)
+
+
+def test_a_pile_takes_the_law_of_another_scene(project):
+    method = "constants+law_from=BouncyBall"
+    plan = project.plan(*CHANGES, f"{RESULTS}/Pile/{method}/metrics.json")
+    assert f"{RESULTS}/BouncyBall/identified.json" in plan.one("evaluate").inputs
 
 
 TOUCHING = {"duck": {"height": 0.4265}, "ball": {"height": 0.4265, "center": [0.6745, 0.5]}}

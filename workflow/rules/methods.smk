@@ -10,13 +10,18 @@ from neuma_lib.project.find import scene_files
 
 
 @cache
-def case_on(scene, method):
-    return cases.case(SETTINGS, scene, method)
+def case_on(scene, method, **how):
+    return cases.case(SETTINGS, scene, method, **how)
 
 
 def of_case(choose):
     """A function of wildcards: something of their case, a method on a scene."""
     return checked(lambda wildcards: choose(case_on(wildcards.scene, wildcards.method)))
+
+
+def of_fit(choose):
+    """The same for a fit, which may be that of several bodies."""
+    return checked(lambda wildcards: choose(case_on(wildcards.scene, wildcards.method, fit=True)))
 
 
 def of_bodies(choose):
@@ -57,7 +62,7 @@ for fitted in (method for method in KINDS.values() if method.product):
         name:
             f"fit_{fitted.name}"
         input:
-            unpack(of_case(fit_files)),
+            unpack(of_fit(fit_files)),
             kernels=kernels(*fitted.fit_kernels),
             obstacles=obstacle_meshes,
         output:
@@ -70,9 +75,9 @@ for fitted in (method for method in KINDS.values() if method.product):
             mem_mb=6000,
             runtime=240,
         params:
-            method=of_case(fit_parameter),
+            method=of_fit(fit_parameter),
             simulation=simulation_settings,
-            densities=of_case(lambda case: case.densities),
+            densities=of_fit(lambda case: case.densities),
             exposure=exposure,
             seed=SETTINGS.seed,
             checkpoint=f"{RESULTS}/{{scene}}/{{method}}/checkpoint.pt",
