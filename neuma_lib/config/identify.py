@@ -33,12 +33,12 @@ class IdentifyConfig(Section):
         "which needs `simulation.contact: particles`",
     )
     frames: int = Field(33, ge=4, description="maximum number of frames, evenly spaced")
-    # A second discretisation. Constants of the material are extrapolated from both.
+    # A second discretisation for the constants of the material. Those of two grids are extrapolated.
     refined_particles: int = Field(
         8000,
         ge=0,
-        description="particles of the bodies on the finer grid, more than `geometry.particles`; 0: no finer grid, and "
-        "no constants of the material, as for a truth on the grid of `simulation`",
+        description="particles of the bodies for the constants of the material, more than `geometry.particles`, on a "
+        "finer grid, or on that of `simulation` if the truth has it too; 0: no constants of the material",
     )
     refinement: float = internal(
         1.5,

@@ -51,23 +51,28 @@ class FamilyFit:
         stds = {key: std for key, _, std in self.quantities(settings)}
         return {"value": self.values[FRICTION], "log_std": stds[FRICTION]} if FRICTION in stds else {}
 
-    def widen_by_ties(self, first: FamilyFit, ties: Sequence[FamilyFit]) -> None:
-        """Increase the covariance by the disagreement of parts of the video and of families with equal scores.
+    def disagreement(self, first: FamilyFit, ties: Sequence[FamilyFit]) -> np.ndarray:
+        """Covariance (k, k) by which parts of the video and families with equal scores disagree.
 
         Args:
-            first: fit to the first frames, whose difference from this fit to all frames is added.
+            first: fit to the first frames, whose difference from this fit to all frames is included.
             ties: fits of other families to the same frames, whose differences from ``first`` in shared constants are
-                added.
+                included.
         """
         u = self.family.unbounded
         before = u(first.values)
-        self.covariance = self.covariance + np.outer(u(self.values) - before, u(self.values) - before)
+        changes = [u(self.values) - before]
         for tie in ties:
             shared = {key: tie.values.get(key, value) for key, value in first.values.items()}
-            self.covariance += np.outer(u(shared) - before, u(shared) - before) / (len(ties) + 1)
+            changes.append((u(shared) - before) / math.sqrt(len(ties) + 1))
+        return sum(np.outer(change, change) for change in changes)
 
-    def extrapolated(self, coarse: FamilyFit, refinement: float) -> FamilyFit:
+    def extrapolated(self, coarse: FamilyFit, refinement: float, more: float) -> FamilyFit:
         """This fit, of a grid with ``refinement`` times as many cells as that of another fit, extrapolated to dx = 0.
+
+        On the same grid, which the truth shares, there is no such limit. Errors of the constants decrease there with the
+        number of particles, of which this fit has ``more`` times as many. The covariance is increased by the square of
+        the distance to the limit of infinitely many.
 
         Errors of the unbounded constants decrease with dx (thin limbs, layers near the floor) or with dx^2 (smooth
         motion). The result is the limit of second order. Its covariance is increased by the square of the distance to
@@ -77,8 +82,12 @@ class FamilyFit:
         """
         u = self.family.unbounded
         change = u(self.values) - u(coarse.values)
-        first, second = (change / (refinement**order - 1) for order in (1, 2))
-        covariance, remainder = self.covariance, first - second
+        if refinement > 1:
+            first, second = (change / (refinement**order - 1) for order in (1, 2))
+            remainder = first - second
+        else:
+            second, remainder = np.zeros_like(change), change / max(more - 1, 1)
+        covariance = self.covariance
         if covariance is not None:
             if coarse.covariance is not None:
                 variances, axes = np.linalg.eigh(coarse.covariance - covariance)

@@ -80,8 +80,8 @@ def identify(
             the views of the settings.
         settings: candidates and hyper-parameters.
         published: specification of the law of the scene's prior, an additional start, or None if unknown.
-        refined: for each video, the body with more particles for a finer grid. Without them, families are selected on
-            the grid of the model, and constants of the material are not estimated.
+        refined: for each video, the body with more particles for a finer grid, or for the same one if ``refinement``
+            is 1. Without them, constants of the material are not estimated.
         other_videos: initial motion, body and observation of other videos of the same material.
         progress: called with (finished fits, number of fits, mean squared residual).
         log: receives a line for every family.
@@ -144,7 +144,7 @@ def identify(
     fits = {run.family.name: run.score() for run in running}
     _log_fits(fits.values(), "", log)
     compared, fine = fits, {}
-    if refined:
+    if other_grid or refined and any(family.field for family in families):
         fine = _on_finer_grid(running, fits, videos, settings)
     if any(each.alive for each in fine.values()):
         compared = {name: each.score() for name, each in fine.items() if each.alive}
@@ -153,15 +153,13 @@ def identify(
     name = selected.family.name
     run = next(run for run in running if run.family is selected.family)
     again = fine.get(name)
-    if more := again is not None and again.alive and not other_grid:
-        run = again
     starts, first = [run.values], rounds - 1
     # If the first frames misled, restart at the coarsest level.
     if selected.held_out > settings.prune_factor * selected.loss:
         starts = [run.values, *(run.family.with_guesses(values) for values in ({}, published_values))]
         first = 0
     counts = [len(video.frames) for video in videos]
-    final = FamilyRun(run.family, videos, counts, settings, fine=more)
+    final = FamilyRun(run.family, videos, counts, settings)
     final.begin(starts, first, run.deviations)
     for level in range(first + 1, rounds if final.alive else 0):
         final.refine(level)
@@ -170,25 +168,35 @@ def identify(
         for video in videos:
             video.set_friction(math.inf)
         sticking, start = Family(run.family.name, run.family.spec), (final.values, final.deviations)
-        final = FamilyRun(sticking, videos, counts, settings, fine=more)
+        final = FamilyRun(sticking, videos, counts, settings)
         final.begin(start[:1], rounds - 1, start[1])
     # Plateaus are properties of the material that both grids show.
     plateaus = final.covariance_of_plateaus() if final.alive else np.zeros(())
-    material = None
-    if other_grid and again and again.alive and final.alive:
+    best, material = final.score(), None
+    before = best.disagreement(fits[name], [fits[tie] for tie in ties])
+    if refined and final.alive and (again is None or again.alive):
         whole = FamilyRun(final.family, videos, counts, settings, fine=True)
-        starts = [{key: each[key] for key in final.values} for each in (again.values, final.values)]
-        whole.begin(starts[: 2 if first == 0 else 1], rounds - 1, final.deviations, like=[final])
+        starts = [again.values] if again else []
+        starts += [final.values] if first == 0 or not again else []
+        starts = [{key: each[key] for key in final.values} for each in starts]
+        whole.begin(starts, rounds - 1, final.deviations, like=[final])
         if whole.alive:
-            material = _final_fit(whole, plateaus, selected, [compared[tie] for tie in ties])
-    if other_grid and material is None:
-        log(f"{name}: no constants of the material, because no simulation on the finer grid is finite")
-    first_fits = compared if more else fits
-    best = _final_fit(final, plateaus, first_fits[name], [first_fits[tie] for tie in ties])
+            material = whole.score()
+            if again:
+                between = material.disagreement(selected, [compared[tie] for tie in ties])
+            else:
+                between = before
+            material.covariance = material.covariance + plateaus + between
+    if best.covariance is not None:
+        best.covariance = best.covariance + plateaus + before
     best.lowest_friction = lowest
     if material is not None:
-        material = material.extrapolated(best, settings.refinement)
+        material = material.extrapolated(best, settings.refinement, len(refined[0].x0) / len(body.x0))
         material.lowest_friction = lowest
+    elif refined:
+        log(
+            f"{name}: no constants of the material, because no simulation with the refined particles is finite"
+        )
     return Identified(
         best,
         ties,
@@ -269,17 +277,6 @@ def _log_fits(fits: Iterable[FamilyFit], where: str, log: Callable[[str], None])
             f"{fit.family.name}{where}: loss {fit.loss:.3e}, held out {fit.held_out:.3e}, {fit.rollouts} rollouts, "
             + ", ".join(f"{key} {value:.4g}" for key, value in fit.values.items())
         )
-
-
-def _final_fit(
-    run: FamilyRun, plateaus: np.ndarray, selected: FamilyFit, ties: Sequence[FamilyFit]
-) -> FamilyFit:
-    """The fit of a run to all frames, with an uncertainty that includes ``plateaus``, parts of the video, and ties."""
-    fit = run.score()
-    if fit.covariance is not None:
-        fit.covariance = fit.covariance + plateaus
-        fit.widen_by_ties(selected, ties)
-    return fit
 
 
 def _first_fit(

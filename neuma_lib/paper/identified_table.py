@@ -17,14 +17,14 @@ SHARE = Fraction(4, 5)
 RIGHT, TIE, WRONG = "right", "tie", "wrong"
 MATERIAL, GRID = "of the material", "on the grid"
 FITS = {MATERIAL: "material", GRID: "best"}
-"""Entries of identified.json with constants extrapolated to a cell size of zero, and with those of the fit's grid."""
+"""Entries of identified.json with the constants of the material, and with those of the fit's grid and particles."""
 COLUMNS = "quantity value truth error_percent log_std error_in_std determined".split()
 """Columns of a quantity in the CSV."""
 
 RULE = (
     "A family is right if it is the one that the truth was simulated with, or ties with it. Constants, moduli and "
-    "ratios of the identified family count that the truth has too. A converged truth is compared with the constants of "
-    "the material, another one with those on the grid that it shares with the fit. *Determined* are those with an "
+    "ratios of the identified family count that the truth has too. Claims count the constants of the material where there "
+    "are any, else those on the grid that fit and truth share. *Determined* are those with an "
     "estimated standard deviation below `identify.determined`. A claim *holds* if the count is reached, else it *does "
     "not hold*. Several replicates of a scene are not independent."
 )
@@ -78,9 +78,8 @@ def identified_table(scenes: Sequence[Mapping[str, Any]]) -> tuple[str, str]:
     """CSV with a row for each quantity, and Markdown with a row for each scene and verdicts for each group.
 
     Args:
-        scenes: ``name``, ``group`` of the scenes that claims count together, ``converged``, whether the truth is,
-            ``identified``, the content of identified.json, and ``truth``, the specification of the true law, for each
-            scene and replicate.
+        scenes: ``name``, ``group`` of the scenes that claims count together, ``identified``, the content of
+            identified.json, and ``truth``, the specification of the true law, for each scene and replicate.
 
     Raises:
         InputError: there are no scenes.
@@ -95,7 +94,7 @@ def identified_table(scenes: Sequence[Mapping[str, Any]]) -> tuple[str, str]:
         for of, compared in quantities.items():
             rows += [[scene["name"], identified["family"], verdict, of, *row.values()] for row in compared]
         tied = f", as good: {', '.join(identified['ties'])}" if identified["ties"] else ""
-        counted_of = MATERIAL if scene["converged"] else GRID
+        counted_of = MATERIAL if FITS[MATERIAL] in identified else GRID
         listed = [_listed(quantities[of], True) for of in FITS] + [_listed(quantities[counted_of], False)]
         cells = [scene["name"], f"{identified['family']} ({verdict}{tied})", *listed]
         groups.setdefault(scene["group"], []).append((cells, verdict, quantities[counted_of]))

@@ -262,8 +262,7 @@ class Config(Section):
         """Settings of the identification of a scene, in its replicate.
 
         A truth that was simulated on the grid of `simulation` has no limit for smaller cells. Identification of such
-        a scene uses no finer grid, and selects the family on the grid that it shares with the truth. If a candidate has
-        a field, it uses the refined particles on that grid as well, because few particles appear as a field.
+        a scene uses the refined particles on the same grid.
 
         Raises:
             InputError: the finer grid would not have more particles than `geometry.particles`.
@@ -280,9 +279,7 @@ class Config(Section):
             self.scene(video).has_truth and self.scene_truth(video).grid == self.simulation.grid
             for video in videos
         )
-        with_fields = any(law.field for law in self.identify.families.values())
-        only = {"refinement": 1.0} if with_fields else {"refined_particles": 0}
-        return self.identify.model_copy(update=only) if shared else self.identify
+        return self.identify.model_copy(update={"refinement": 1.0}) if shared else self.identify
 
     def body_scenes(self, column: str) -> list[str]:
         """Folders of the scenes whose laws the bodies of a scene or experiment have, in its replicate."""

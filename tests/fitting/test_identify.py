@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from neuma_lib.config.identify import IdentifyConfig
 from neuma_lib.config.laws import LawConfig
@@ -31,6 +32,7 @@ from neuma_lib.fitting.least_squares import (
     secant_update,
 )
 from neuma_lib.fitting.video_residuals import Candidate, VideoResiduals, averaged, finer
+from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.io.files import write_json
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.catalogue import COURANT_LIMIT
@@ -311,6 +313,31 @@ def test_two_grids_give_the_constants_of_the_material():
     assert "of the material" in written["says"]
 
 
+def test_more_particles_give_the_constants_of_the_material_on_a_shared_grid():
+    """Few particles of the body appear as another material, which predicts their motion best."""
+    truth, body = law("hencky", E=3e4, nu=0.35), ball()
+    mesh = trimesh.creation.icosphere(4, RADIUS).apply_translation([0.5, HEIGHT, 0.5])
+
+    def filled(count, seed):
+        return body.resampled(torch.from_numpy(sample_volume(mesh, count, seed)), mesh.volume, 1000.0)
+
+    few, many, true = filled(120, 1), filled(2000, 2), filled(2000, 3)
+    path = rollout(
+        MODEL, analytic_law(truth, MODEL.dt), known(true).of_body(true), steps=FRAMES[-1], frames=FRAMES
+    )
+    cameras = camera(32, few.x0.dtype)
+    seen = Observation(FRAMES, true.particle_gs(cameras)(path.x, path.F), cameras)
+    options = settings({"hencky": ELASTIC}, covariance_from="elastic", refinement=1)
+    alone = identify(MODEL, known(few), few, seen, options)
+    result = identify(MODEL, known(few), few, seen, options, refined=[many])
+    error = {
+        name: abs(math.log(fit.values["E"] / 3e4)) + abs(fit.values["nu"] - 0.35)
+        for name, fit in (("grid", result.best), ("material", result.material))
+    }
+    assert result.best.values == alone.best.values and result.fits.keys() == {"hencky"}
+    assert error["material"] < error["grid"] / 2
+
+
 def test_the_finer_grid_decides_between_families_of_similar_scores(monkeypatch):
     """Scores are given: on the grid of the model hencky is best, neo_hookean close and fixed_corotated far."""
     coarse = {"hencky": -8.0, "neo_hookean": -7.5, "stvk": -7.0, "fixed_corotated": -6.0}
@@ -375,18 +402,31 @@ def test_an_extrapolation_covers_both_orders_of_convergence(refinement):
         return FamilyFit(family, {"E": 1e5 * math.exp(log_error), "nu": 0.3}, covariance=covariance)
 
     for order, deviations in ((1, 1.0), (2, 0.0)):
-        fine = fit(0.1 / refinement**order, 1e-6 * np.eye(2)).extrapolated(fit(0.1), refinement)
+        fine = fit(0.1 / refinement**order, 1e-6 * np.eye(2)).extrapolated(fit(0.1), refinement, 4)
         error, std = math.log(fine.values["E"] / 1e5), math.sqrt(fine.covariance[0, 0] - 1e-6)
         assert abs(error) == pytest.approx(deviations * std, rel=1e-6, abs=1e-9) and std > 1e-3
         assert fine.values["nu"] == pytest.approx(0.3) and fine.covariance[1, 1] == pytest.approx(1e-6)
     vague = np.array([[0.5, 1e-5], [1e-5, 1e-8]])
-    joined = fit(0.0, 1e-6 * np.eye(2)).extrapolated(fit(0.0, vague), refinement).covariance
+    joined = fit(0.0, 1e-6 * np.eye(2)).extrapolated(fit(0.0, vague), refinement, 4).covariance
     assert all(np.linalg.eigvalsh(joined - each).min() > -1e-12 for each in (vague, 1e-6 * np.eye(2)))
     assert np.trace(joined) < np.trace(vague) + 3e-6, "the larger of both, not their sum"
-    far = fit(-math.log(9), 1e-6 * np.eye(2)).extrapolated(fit(0.0), refinement)
+    far = fit(-math.log(9), 1e-6 * np.eye(2)).extrapolated(fit(0.0), refinement, 4)
     limited = -math.log(9) - math.log(2) / (refinement**2 - 1)
     assert math.log(far.values["E"] / 1e5) == pytest.approx(limited)
     assert far.covariance[0, 0] > 0.5 * (math.log(9) / refinement) ** 2
+
+
+def test_more_particles_on_the_same_grid_are_not_extrapolated():
+    """The remaining error, if it is proportional to the inverse of the number, is one standard deviation."""
+    family = Family("hencky", ELASTIC)
+
+    def fit(count):
+        values = {"E": 1e5 * math.exp(0.4 * 1000 / count), "nu": 0.3}
+        return FamilyFit(family, values, covariance=1e-6 * np.eye(2))
+
+    material = fit(4000).extrapolated(fit(1000), 1.0, 4)
+    assert material.values == pytest.approx(fit(4000).values)
+    assert math.sqrt(material.covariance[0, 0] - 1e-6) == pytest.approx(0.1)
 
 
 def test_a_constant_at_its_bound_leaves_uncertain_what_depends_on_it():

@@ -89,13 +89,14 @@ def test_few_particles_are_no_field():
         few, many = sampled(300, seed), (sampled(1500, 100 + seed), sampled(1500, 200 + seed))
         assert identified(None, bodies=(many[0], few, None)).best.family.field
         result = identified(None, bodies=(many[0], few, many[1]))
-        assert result.best.family.name == "uniform" and result.material is None
-        assert result.best.values["E"] == pytest.approx(4e4, rel=0.1)
+        assert result.best.family.name == result.material.family.name == "uniform"
+        assert result.material.values["E"] == pytest.approx(4e4, rel=0.1)
     ramp = {"name": "ramp", "ratio": 3.0}
     many = sampled(1500, 100), sampled(1500, 200)
     result = identified(ramp, bodies=(many[0], sampled(300, 0), many[1]))
     assert result.best.family.name == "ramp"
-    ends = result.best.values["E"], result.best.values["E"] * result.best.values["ratio"]
+    values = result.material.values
+    ends = values["E"], values["E"] * values["ratio"]
     assert ends == pytest.approx((4e4, 1.2e5), rel=0.2)
 
 

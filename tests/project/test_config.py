@@ -398,20 +398,12 @@ class TestTruth:
         assert own.frame_steps("BouncyBall") == loaded.frame_steps("BouncyBall")
 
     def test_a_truth_on_the_grid_of_the_simulation_is_identified_on_it_alone(self, loaded, changed):
-        assert loaded.identify_of("BouncyBall+seed=1").refined_particles == 0
+        shared = loaded.identify_of("BouncyBall+seed=1")
+        assert shared == loaded.identify.model_copy(update={"refinement": 1.0})
         assert loaded.identify_of("BouncyBall_converged+seed=1") == loaded.identify
         assert loaded.identify.refined_particles > 0
         refined = changed(dataset={"grid": 40}, random={"count": 0})
         assert refined.identify_of("BouncyBall") == refined.identify
-        ramp = {
-            "elasticity": {"name": "hencky", "E": 1e5, "nu": 0.3},
-            "field": {"name": "ramp", "ratio": 1.0},
-        }
-        uneven = changed(identify={"families": {"ramp": ramp}}, random={"count": 0})
-        with_field = uneven.identify_of("BouncyBall")
-        assert (
-            with_field.refinement == 1 and with_field.refined_particles == uneven.identify.refined_particles
-        )
 
     def test_the_converged_table_has_96_cells_and_is_optional(self, loaded, changed):
         table = loaded.tables["table1_converged"]

@@ -61,12 +61,7 @@ def identified_behind(table):
 def with_truths(groups):
     """Scenes with their groups and true laws."""
     return [
-        {
-            "name": name,
-            "group": group,
-            "truth": SETTINGS.scene(name).law.plain(),
-            "converged": SETTINGS.scene_truth(name).grid > SETTINGS.simulation.grid,
-        }
+        {"name": name, "group": group, "truth": SETTINGS.scene(name).law.plain()}
         for name, group in groups.items()
     ]
 
