@@ -70,7 +70,7 @@ class FamilyFit:
     def extrapolated(self, coarse: FamilyFit, refinement: float, more: float) -> FamilyFit:
         """This fit, of a grid with ``refinement`` times as many cells as that of another fit, extrapolated to dx = 0.
 
-        On the same grid, which the truth shares, there is no such limit. Errors of the constants decrease there with the
+        On the same grid, which the truth shares, there is no such limit. Errors of the constants decrease with the
         number of particles, of which this fit has ``more`` times as many. The covariance is increased by the square of
         the distance to the limit of infinitely many.
 

@@ -23,9 +23,9 @@ COLUMNS = "quantity value truth error_percent log_std error_in_std determined".s
 
 RULE = (
     "A family is right if it is the one that the truth was simulated with, or ties with it. Constants, moduli and "
-    "ratios of the identified family count that the truth has too. Claims count the constants of the material where there "
-    "are any, else those on the grid that fit and truth share. *Determined* are those with an "
-    "estimated standard deviation below `identify.determined`. A claim *holds* if the count is reached, else it *does "
+    "ratios of the identified family count that the truth has too. Claims count the constants of the material if there "
+    "are any, else those on the grid that fit and truth share. *Determined* are those with an estimated standard "
+    "deviation below `identify.determined`. A claim *holds* if the count is reached, else it *does "
     "not hold*. Several replicates of a scene are not independent."
 )
 """Explanation of the verdicts for readers of the table."""
