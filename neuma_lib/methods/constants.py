@@ -16,7 +16,9 @@ class Constants(Method):
     }
 
     def model_inputs(self, case: Case) -> Files:
-        return {"identified": (case.together[0] if case.together else case).result(case.identified())}
+        if case.together:
+            return {"identified": case.together[0].result("identified.json")}
+        return {"identified": case.result(case.identified())}
 
     def model_options(self, case: Case) -> dict:
         return friction_options(case) | ({"body": case.together[1]} if case.together else {})
