@@ -75,7 +75,7 @@ NAMES = {
     "finer further apart": (_ALONE, "refined, other_*, separate_adaptor"),
     "forget": (_CALLED, "clear_cache"),
     "reconsider": (_CALLED, "restart_from"),
-    "disagree": (_CALLED, "widen_by_ties"),
+    "disagree": (_CALLED, "disagreement"),
     "widened": (_CALLED, "covariance_of_plateaus"),
     "try trial choice": (_CLASS, "Candidate, Score, Selection"),
     "least": (r"(?<!\w)_?(?:least|LEAST)_(?!squares)\w+", "MIN_*, min_*"),

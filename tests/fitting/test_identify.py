@@ -605,16 +605,16 @@ def test_frames_after_the_contact_decide():
 
 def test_what_parts_of_the_video_and_tied_families_disagree_about_is_uncertain():
     """The change since the fit to the first frames, and the scatter of shared constants over families that are as good,
-    are added to the covariance; what is not shared stays unchanged."""
+    are uncertain; what is not shared is not."""
     family, other = Family("plastic", PLASTIC), Family("elastic", law("neo_hookean"))
     values = {"E": 6e4, "nu": 0.3, "yield_stress": 4e3}
     first = FamilyFit(family, {**values, "E": 5e4})
-    fit = FamilyFit(family, values, covariance=np.zeros((3, 3)))
-    fit.widen_by_ties(first, [])
-    np.testing.assert_allclose(np.sqrt(np.diag(fit.covariance)), [math.log(6 / 5), 0, 0], atol=1e-12)
-    fit.widen_by_ties(fit, [FamilyFit(other, {"E": 12e4, "nu": 0.3})])
+    fit = FamilyFit(family, values)
+    alone = fit.disagreement(first, [])
+    np.testing.assert_allclose(np.sqrt(np.diag(alone)), [math.log(6 / 5), 0, 0], atol=1e-12)
+    tied = alone + fit.disagreement(fit, [FamilyFit(other, {"E": 12e4, "nu": 0.3})])
     expected = [math.hypot(math.log(6 / 5), math.log(2) / math.sqrt(2)), 0, 0]
-    np.testing.assert_allclose(np.sqrt(np.diag(fit.covariance)), expected, atol=1e-12)
+    np.testing.assert_allclose(np.sqrt(np.diag(tied)), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("flat", [1.0, 4.0, math.inf])
