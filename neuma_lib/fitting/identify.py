@@ -173,8 +173,8 @@ def identify(
     # Plateaus are properties of the material that both grids show.
     plateaus = final.covariance_of_plateaus() if final.alive else np.zeros(())
     best, material = final.score(), None
-    before = best.disagreement(fits[name], [fits[tie] for tie in ties])
-    if refined and final.alive and (again is None or again.alive):
+    between = best.disagreement(fits[name], [fits[tie] for tie in ties])
+    if refined and final.alive and (again.alive if again else not other_grid):
         whole = FamilyRun(final.family, videos, counts, settings, fine=True)
         starts = [again.values] if again else []
         starts += [final.values] if first == 0 or not again else []
@@ -182,13 +182,10 @@ def identify(
         whole.begin(starts, rounds - 1, final.deviations, like=[final])
         if whole.alive:
             material = whole.score()
-            if again:
-                between = material.disagreement(selected, [compared[tie] for tie in ties])
-            else:
-                between = before
-            material.covariance = material.covariance + plateaus + between
+            own = material.disagreement(selected, [compared[tie] for tie in ties]) if again else between
+            material.covariance = material.covariance + plateaus + own
     if best.covariance is not None:
-        best.covariance = best.covariance + plateaus + before
+        best.covariance = best.covariance + plateaus + between
     best.lowest_friction = lowest
     if material is not None:
         material = material.extrapolated(best, settings.refinement, len(refined[0].x0) / len(body.x0))
