@@ -7,7 +7,10 @@ params.code     digest of the script, of the library modules behind it, and of o
 resources       `RESOURCES`, and one thread (Snakemake's own default)
 """
 
+import os
+import shutil
 from collections.abc import Callable, Collection
+from importlib.metadata import version
 from pathlib import Path
 
 from neuma_lib.mechanics.catalogue import DEFINED_IN
@@ -15,6 +18,17 @@ from workflow.provenance import code_digest, digest_of_files, law_files
 
 RESOURCES = {"gpu": 0, "mem_mb": 4000, "runtime": 60}  # GPUs, MB, minutes
 CONDA = "../../envs/conda.yaml"  # relative to the files of the rules
+
+
+def sees_cuda() -> bool:
+    """Whether torch probably finds a CUDA device: there is a driver, the build of torch has CUDA, and
+    `CUDA_VISIBLE_DEVICES` is not empty. `torch.cuda.is_available` is exact, but the import takes seconds.
+    """
+    return (
+        shutil.which("nvidia-smi") is not None
+        and not version("torch").endswith("+cpu")
+        and os.environ.get("CUDA_VISIBLE_DEVICES") != ""
+    )
 
 
 def complete(workflow, results: str, known: Collection[str] = ()) -> None:

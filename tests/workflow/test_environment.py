@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 import yaml
 
+from workflow.defaults import sees_cuda
+
 ROOT = Path(__file__).resolve().parents[2]
 ENVS = ROOT / "envs"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -61,3 +63,23 @@ def test_a_missing_python_is_named(tmp_path):
     assert done.returncode != 0
     assert "Python 3.11 is needed" in done.stderr and "apt-get install python3.11" in done.stderr
     assert not (tmp_path / "venv").exists()
+
+
+@pytest.mark.parametrize(
+    "program, torch, devices, seen",
+    [
+        ("/usr/bin/nvidia-smi", "2.13.0", None, True),
+        ("/usr/bin/nvidia-smi", "2.13.0+cu128", "0,1", True),
+        (None, "2.13.0", None, False),
+        ("/usr/bin/nvidia-smi", "2.13.0+cpu", None, False),
+        ("/usr/bin/nvidia-smi", "2.13.0", "", False),
+    ],
+)
+def test_jobs_use_a_gpu_only_if_torch_can(program, torch, devices, seen, monkeypatch):
+    """A driver alone made every job one for the GPU, of which one runs at a time."""
+    monkeypatch.setattr("workflow.defaults.shutil.which", lambda name: program)
+    monkeypatch.setattr("workflow.defaults.version", lambda name: torch)
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    if devices is not None:
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", devices)
+    assert sees_cuda() is seen

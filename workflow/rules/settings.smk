@@ -2,7 +2,6 @@
 
 import gc
 import os
-import shutil
 import sys
 from pathlib import Path
 
@@ -19,7 +18,7 @@ from neuma_lib.project.project import remember_settings, remembered_settings
 from neuma_lib.errors import InputError
 from neuma_lib.mechanics.catalogue import DEFINED_IN
 from neuma_lib.methods.registry import methods
-from workflow.defaults import complete, digest_of
+from workflow.defaults import complete, digest_of, sees_cuda
 from workflow.provenance import code_digest
 from workflow.progress import show_one_line_a_job
 from workflow.records import (
@@ -59,7 +58,7 @@ RESULTS = SETTINGS.results_root.rstrip("/")
 if workflow.is_main_process:
     remake_deleted_folders(RESULTS)
 KERNELS = f"{DATA}/kernels"  # what is known of them; they themselves are in SETTINGS.kernel_cache
-HAS_CUDA = shutil.which("nvidia-smi") is not None
+HAS_CUDA = sees_cuda()
 GPU = int({"cpu": False, "cuda": True, "auto": HAS_CUDA}[SETTINGS.device])
 # Kernels and ground truths are made with or without a GPU, so that its images can be rendered where none is.
 EITHER_DEVICE = "cpu" if SETTINGS.device == "cpu" else "auto"
