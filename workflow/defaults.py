@@ -20,15 +20,16 @@ RESOURCES = {"gpu": 0, "mem_mb": 4000, "runtime": 60}  # GPUs, MB, minutes
 CONDA = "../../envs/conda.yaml"  # relative to the files of the rules
 
 
-def sees_cuda() -> bool:
-    """Whether torch probably finds a CUDA device: there is a driver, the build of torch has CUDA, and
-    `CUDA_VISIBLE_DEVICES` is not empty. `torch.cuda.is_available` is exact, but the import takes seconds.
+def has_gpu() -> bool:
+    """Whether an NVIDIA driver is there and `CUDA_VISIBLE_DEVICES` does not hide all devices. Blender can use them."""
+    return shutil.which("nvidia-smi") is not None and os.environ.get("CUDA_VISIBLE_DEVICES") not in ("", "-1")
+
+
+def torch_has_gpu() -> bool:
+    """Whether torch can probably use a GPU: its build has CUDA, too. `torch.cuda.is_available` is exact, but the import
+    takes seconds.
     """
-    return (
-        shutil.which("nvidia-smi") is not None
-        and not version("torch").endswith("+cpu")
-        and os.environ.get("CUDA_VISIBLE_DEVICES") != ""
-    )
+    return has_gpu() and not version("torch").endswith("+cpu")
 
 
 def complete(workflow, results: str, known: Collection[str] = ()) -> None:

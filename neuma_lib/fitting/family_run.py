@@ -29,7 +29,7 @@ from neuma_lib.fitting.least_squares import (
 from neuma_lib.fitting.video_residuals import MOTION, NUISANCES, Candidate, VideoResiduals, averaged
 from neuma_lib.mechanics.combinations import Values
 
-_LAST_GAIN = 0.1  # default of `last_gain`
+_LAST_GAIN = 0.1  # factor on `min_gain` at the last level, unless the fit is rough
 _EXCLUDED = 2.0  # standard deviations at which a Coulomb coefficient is excluded
 _FRICTIONS, _FRICTION_FACTOR = 8, 2.0  # coefficients that are tried together, and their ratio
 _MIN_LOSS = 1e-12  # held-out loss of images that agree exactly
@@ -143,15 +143,12 @@ class FamilyRun:
             self._u, self._images = points[best], {points[best].tobytes(): residuals[best]}
             self.refine(self._level)
 
-    def refine(
-        self, level: int, rough: bool = False, limit: float = math.inf, last_gain: float = _LAST_GAIN
-    ) -> None:
+    def refine(self, level: int, rough: bool = False, limit: float = math.inf) -> None:
         """Continue the fit at a level of the pyramid.
 
         Args:
             rough: end early, with derivatives that have been updated, as always before the last level.
             limit: cost beyond which the fit ends.
-            last_gain: factor on `IdentifyConfig.min_gain` at the last level, unless the fit is rough.
         """
         self._level, last = level, level == len(self.settings.pyramid) - 1
         self._u, self.fit, steps = levenberg_marquardt(
@@ -159,7 +156,7 @@ class FamilyRun:
             self._u,
             self._free,
             self._prior,
-            self.settings.min_gain * (1.0 if rough or not last else last_gain),
+            self.settings.min_gain * (1.0 if rough or not last else _LAST_GAIN),
             self.settings.iterations,
             longest=self.settings.longest_step,
             secant=True,

@@ -179,9 +179,7 @@ def identify(
         starts = [again.values] if again else []
         starts += [final.values] if first == 0 or not again else []
         starts = [{key: each[key] for key in final.values} for each in starts]
-        # Where nothing is extrapolated, errors of the fit are not enlarged.
-        last_gain = {"last_gain": 1.0} if settings.refinement == 1 else {}
-        whole.begin(starts, rounds - 1, final.deviations, like=[final], **last_gain)
+        whole.begin(starts, rounds - 1, final.deviations, like=[final])
         if whole.alive:
             material = whole.score()
             own = material.disagreement(selected, [compared[tie] for tie in ties]) if again else between

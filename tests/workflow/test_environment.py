@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from workflow.defaults import sees_cuda
+from workflow.defaults import has_gpu, torch_has_gpu
 
 ROOT = Path(__file__).resolve().parents[2]
 ENVS = ROOT / "envs"
@@ -66,20 +66,23 @@ def test_a_missing_python_is_named(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "program, torch, devices, seen",
+    "program, torch, devices, gpu, torch_gpu",
     [
-        ("/usr/bin/nvidia-smi", "2.13.0", None, True),
-        ("/usr/bin/nvidia-smi", "2.13.0+cu128", "0,1", True),
-        (None, "2.13.0", None, False),
-        ("/usr/bin/nvidia-smi", "2.13.0+cpu", None, False),
-        ("/usr/bin/nvidia-smi", "2.13.0", "", False),
+        ("/usr/bin/nvidia-smi", "2.13.0", None, True, True),
+        ("/usr/bin/nvidia-smi", "2.13.0+cu128", "0,1", True, True),
+        (None, "2.13.0", None, False, False),
+        ("/usr/bin/nvidia-smi", "2.13.0+cpu", None, True, False),
+        ("/usr/bin/nvidia-smi", "2.13.0", "", False, False),
+        ("/usr/bin/nvidia-smi", "2.13.0", "-1", False, False),
     ],
 )
-def test_jobs_use_a_gpu_only_if_torch_can(program, torch, devices, seen, monkeypatch):
+def test_jobs_use_a_gpu_only_if_torch_can_and_blender_with_the_driver(
+    program, torch, devices, gpu, torch_gpu, monkeypatch
+):
     """A driver alone made every job one for the GPU, of which one runs at a time."""
     monkeypatch.setattr("workflow.defaults.shutil.which", lambda name: program)
     monkeypatch.setattr("workflow.defaults.version", lambda name: torch)
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     if devices is not None:
         monkeypatch.setenv("CUDA_VISIBLE_DEVICES", devices)
-    assert sees_cuda() is seen
+    assert (has_gpu(), torch_has_gpu()) == (gpu, torch_gpu)

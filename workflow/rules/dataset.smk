@@ -2,7 +2,7 @@
 
 BLENDER = SETTINGS.dataset.blender
 RENDER_DEVICE = EITHER_DEVICE if BLENDER.device == "auto" else BLENDER.device
-RENDER_GPU = {"cpu": 0, "auto": EITHER_GPU, "cuda": 1}[RENDER_DEVICE]
+RENDER_GPU = {"cpu": 0, "auto": int(has_gpu()), "cuda": 1}[RENDER_DEVICE]
 
 
 # Marker, log and benchmark lie with the data and not in the cache, which folders may share: where one of them is

@@ -18,7 +18,7 @@ from neuma_lib.project.project import remember_settings, remembered_settings
 from neuma_lib.errors import InputError
 from neuma_lib.mechanics.catalogue import DEFINED_IN
 from neuma_lib.methods.registry import methods
-from workflow.defaults import complete, digest_of, sees_cuda
+from workflow.defaults import complete, digest_of, has_gpu, torch_has_gpu
 from workflow.provenance import code_digest
 from workflow.progress import show_one_line_a_job
 from workflow.records import (
@@ -58,7 +58,7 @@ RESULTS = SETTINGS.results_root.rstrip("/")
 if workflow.is_main_process:
     remake_deleted_folders(RESULTS)
 KERNELS = f"{DATA}/kernels"  # what is known of them; they themselves are in SETTINGS.kernel_cache
-HAS_CUDA = sees_cuda()
+HAS_CUDA = torch_has_gpu()
 GPU = int({"cpu": False, "cuda": True, "auto": HAS_CUDA}[SETTINGS.device])
 # Kernels and ground truths are made with or without a GPU, so that its images can be rendered where none is.
 EITHER_DEVICE = "cpu" if SETTINGS.device == "cpu" else "auto"
