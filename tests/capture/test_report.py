@@ -9,7 +9,7 @@ from PIL import Image
 
 from neuma_lib.capture.report import warnings as module
 from neuma_lib.capture.report.images import COLUMNS
-from neuma_lib.capture.report.page import Check
+from neuma_lib.capture.report.page import Check, object_checks
 from neuma_lib.capture.report.report import Film, number, page, picture_uri, prefixed, room_value
 from neuma_lib.evaluation.calibration import interval
 from tests.support.errors import refused
@@ -175,6 +175,25 @@ def test_a_body_that_sticks_has_a_lower_bound_of_its_friction():
     assert "contact_friction" in text and "at least 0.75" in text
 
 
+def test_each_of_several_bodies_has_its_law_and_each_pair_its_friction():
+    pairs = [
+        {"bodies": ["clay", "gum"], "friction": 0.4, "log_std": 0.1},
+        {"bodies": ["gum", "ball"], "friction": 0.5, "log_std": 3.0},
+    ]
+    bodies = {"clay": identified(), "gum": identified(family="hencky", ties=["von_mises"])}
+    several = {"bodies": bodies, "pairs": pairs, "hidden": {"clay": [0.0, 0.25], "gum": [0.0, 0.0]}}
+    text = Reader(page("pile", "Constants", identified=several)).text
+    assert "clay: identified family: von_mises" in text
+    assert "gum: identified family: hencky, tied with von_mises" in text
+    assert text.count("Other bodies hide up to") == 2 and "25 %" in text
+    low, high = interval(0.4, 0.1, quantity="grid")
+    assert f"clay and gum0.4{number(low)} to {number(high)}" in text
+    assert "gum and ball0.5unknown" in text
+    tie, *open_ = sorted(module.constants_warnings(several), key=lambda line: "equally" not in line)
+    assert tie.startswith("gum: The families hencky, von_mises")
+    assert [line.partition(":")[0] for line in open_] == ["clay", "gum"]
+
+
 @pytest.mark.parametrize(
     "value, text",
     [
@@ -195,7 +214,8 @@ def test_stresses_have_prefixes():
     assert prefixed(250.0, "Pa") == (1.0, "Pa") and prefixed(2.5e5, "°") == (1.0, "°")
 
 
-CAPTURE = {"density": 900.0, "density_stated": True, "held_out": ["two"]}
+DENSITY = {"value": 900.0, "stated": True}
+CAPTURE = {"densities": {"": DENSITY}, "held_out": ["two"]}
 GOOD_FLIGHT = {"spin_rad_s": [0, 1, 0]}
 GOOD_MOTION = {
     "fastest_m_s": 2.0,
@@ -207,7 +227,9 @@ GOOD_MOTION = {
 
 def take(**changes):
     cameras = {"left": 1e-3, "right": 1e-3}
-    return {"one": {"cameras": cameras, "flight": GOOD_FLIGHT, "prediction": GOOD_MOTION, **changes}}
+    return {
+        "one": {"cameras": cameras, "flights": {"one": GOOD_FLIGHT}, "prediction": GOOD_MOTION, **changes}
+    }
 
 
 def test_a_capture_without_faults_has_no_warnings():
@@ -224,15 +246,18 @@ def test_a_capture_without_faults_has_no_warnings():
     "changes, message",
     [
         ({"cameras": {"left": 1e-3}}, "only one camera"),
-        ({"flight": {"spin_rad_s": None}}, "no spin was measured"),
+        ({"flights": {"one, gum": {"spin_rad_s": None}}}, "one, gum: no spin was measured"),
         ({"cameras": {"left": 1e-3, "right": 0.0}}, "no exposure is set for right.*2.0 mm"),
         (
-            {"flight": {**GOOD_FLIGHT, "row_delay_s": {"left": 2e-3, "right": 1e-4}}},
+            {"flights": {"one": {**GOOD_FLIGHT, "row_delay_s": {"left": 2e-3, "right": 1e-4}}}},
             "no row_time.*at most 4.0 mm for left at",
         ),
         ({"prediction": {**GOOD_MOTION, "frames_after_contact": {"left": 3}}}, "one, left: only 3 frames"),
         ({"prediction": {**GOOD_MOTION, "touched": ["x_min"]}}, "touches the box .x_min."),
-        ({"registration": {"ambiguous": "it looks alike"}}, "does not determine the pose .*: it looks alike"),
+        (
+            {"registrations": {"one, gum": {"ambiguous": "it looks alike"}, "one, clay": {}}},
+            "one, gum: the flight does not determine the pose .*: it looks alike",
+        ),
     ],
 )
 def test_each_fault_of_filming_is_named(changes, message):
@@ -240,9 +265,17 @@ def test_each_fault_of_filming_is_named(changes, message):
     assert re.search(message, result)
 
 
+def test_each_fit_of_gaussians_is_checked():
+    fit = {"held_out": ["a"], "count": 900}
+    good, bad = object_checks({"": fit | {"psnr_object": 25.0}, "gum": fit | {"psnr_object": 15.0}})
+    assert good.good and not bad.good and bad.what.endswith(", gum") and "15.0 dB" in bad.value
+
+
 def test_what_nobody_stated_or_held_out_is_named():
-    (density,) = module.filming_warnings({**CAPTURE, "density_stated": False}, take())
-    assert "900 kg/m³" in density
+    for bodies, message in (("", "The density is the default"), ("gum", "The density of gum is the default")):
+        densities = {"clay": DENSITY, bodies: {**DENSITY, "stated": False}}
+        (density,) = module.filming_warnings({**CAPTURE, "densities": densities}, take())
+        assert density.startswith(message) and "900 kg/m³" in density
     (held,) = module.filming_warnings({**CAPTURE, "held_out": []}, take())
     assert "No take is held out" in held
 

@@ -68,10 +68,8 @@ TARGETS = [
 ]
 
 
-def run_in_full(project: Project) -> Project:
-    """Make all targets in a project that has Table 1, with stand-in weights of LPIPS."""
-    for name in ("own_law.py", "own_method.py"):
-        shutil.copy(ROOT / "tests/support" / name, project.root)
+def write_lpips(project: Project) -> None:
+    """Stand-in weights of LPIPS."""
     generator = torch.Generator().manual_seed(0)
     weights = {
         name: 0.1 * (torch.rand(shape, generator=generator) - 0.4)
@@ -79,6 +77,13 @@ def run_in_full(project: Project) -> Project:
         for name, shape in expected_shapes(net).items()
     }
     write_weights(project.root / "tiny/data/weights/lpips.safetensors", weights, {})
+
+
+def run_in_full(project: Project) -> Project:
+    """Make all targets in a project that has Table 1, with stand-in weights of LPIPS."""
+    for name in ("own_law.py", "own_method.py"):
+        shutil.copy(ROOT / "tests/support" / name, project.root)
+    write_lpips(project)
     project.output = project.run(*SETTINGS, *TARGETS)
     project.ran = Plan.of(project.output, TARGETS)
     return project

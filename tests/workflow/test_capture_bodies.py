@@ -13,6 +13,7 @@ from neuma_lib.io.images import read_labels
 from neuma_lib.io.mesh import read_mesh
 from tests.support.board_pictures import LENS, around, looking_at
 from tests.support.drawn_board import Eye, Solid, write_video
+from tests.support.full_run import write_lpips
 from tests.support.project import copied, overlay
 
 SETTINGS = """\
@@ -84,12 +85,13 @@ def project(tmp_path, kernels, drawn):
 
 
 def test_labelled_bodies_enter_the_rules_of_several_bodies(project):
-    plan = project.plan(f"{TAKE}/constants/rollout.h5")
+    plan = project.plan(f"{PILE}/constants/report.html")
     counts = {"capture_photograph_masks": 1, "gaussians_of_bodies": 1, "capture_video_masks": 6}
     counts |= {rule: 2 for rule in ("body_gaussians", "body_static", "mesh", "binding")}
     counts |= {"capture_flight": 2, "capture_registration": 2, "capture_video": 1, "identify_bodies": 1}
-    counts |= {"experiment_start": 1, "predict": 1}
+    counts |= {"experiment_start": 1, "predict": 2, "capture_view": 4, "capture_display": 1}  # with the prior
     assert {rule: plan[rule] for rule in counts} == counts
+    assert not plan["capture_curves"]
     assert plan["capture_poses"] == plan["capture_room"] == 1 and not plan["velocity_of_bodies"]
 
 
@@ -126,7 +128,9 @@ def test_drawn_bodies_are_reconstructed_placed_and_identified(project):
     gaussians = {"iterations": 300, "initial_count": 600, "hull_resolution": 32}
     changes = overlay(identify=identify, gaussians=gaussians, viewer={"methods": ["constants"]})
     videos = [f"tiny/data/pile_first{part}/dynamic/transforms.json" for part in ("", "_clay", "_gum")]
-    project.run(*changes, f"{TAKE}/viewer.html", f"{PILE}/motion.md", *videos)
+    write_lpips(project)
+    report = f"{PILE}/constants/report.html"
+    project.run(*changes, f"{TAKE}/viewer.html", f"{PILE}/motion.md", report, *videos)
     root = project.root
     for name, radii in RADII.items():
         mesh = read_mesh(root / f"{PILE}_{name}/mesh.ply")
@@ -154,6 +158,17 @@ def test_drawn_bodies_are_reconstructed_placed_and_identified(project):
     names = (root / TAKE / "viewer.html").read_text()
     assert '"clay"' in names and '"gum"' in names
     assert identified["hidden"]["clay"][0] > 0.1 > identified["hidden"]["gum"][0]
+    text = (root / report).read_text()
+    for part in (
+        "clay: identified family: soft",
+        "clay and gum",
+        "Free flight: first, gum",
+        "1500 (clay), 1000 (gum)",
+    ):
+        assert part in text
+    assert "is missing" not in text and "The density of gum is the default" in text
+    for camera in ("left", "right"):
+        assert read_json(root / f"{TAKE}/constants/views/{camera}.json")["mean"]["iou"] > 0.8
     for file in (root / "captures/pile/masks/first/left").iterdir():
         pixels = np.asarray(Image.open(file))
         Image.fromarray(np.where(pixels == 200, 40, pixels).astype(np.uint8)).save(file)

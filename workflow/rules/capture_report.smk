@@ -8,13 +8,13 @@ rule capture_display:
         videos=TAKE_VIDEOS,
         mattes=of_take_cameras(MATTES),
         dynamic=f"{DATA}/{{scene}}/dynamic/transforms.json",
-        registration=f"{RESULTS}/{{scene}}/registration.json",
+        registration=of_each_body(lambda wildcards: f"{RESULTS}/{wildcards.scene}/registration.json"),
         room=captured_file(f"{DATA}/{{capture}}/room/transforms.json"),
         report=captured_file(f"{RESULTS}/{{capture}}/room.json"),
     output:
         transforms=DISPLAY,
     wildcard_constraints:
-        scene=OWN_TAKE,
+        scene=f"(?!{CAPTURED_PART}/){OWN_TAKE}",
     conda:
         CAPTURE_ENVIRONMENT
     params:
@@ -131,13 +131,13 @@ REPORTED = {
     "timelines": of_videos(f"{VIDEO_FRAMES}.json"),
     "photographs": f"{RESULTS}/{{capture}}/masks/photographs.json",
     "photograph_sheet": f"{RESULTS}/{{capture}}/masks/photographs.png",
-    "masks": of_videos(f"{VIDEO_MASKS}.json"),
-    "mask_sheets": of_videos(f"{VIDEO_MASKS}.png"),
+    "masks": of_body_videos(f"{VIDEO_MASKS}.json"),
+    "mask_sheets": of_body_videos(f"{VIDEO_MASKS}.png"),
     "flights": of_takes(f"{FLIGHT}.json"),
     "flight_pictures": of_takes(f"{FLIGHT}.png"),
-    "object": f"{RESULTS}/{{capture}}/gaussians.json",
-    "registrations": of_takes(f"{RESULTS}/{scene_name('{capture}', '{take}')}/registration.json"),
-    "registration_pictures": of_takes(f"{RESULTS}/{scene_name('{capture}', '{take}')}/registration.png"),
+    "objects": of_capture(lambda capture: list(object_reports(capture).values())),
+    "registrations": of_registrations("registration.json"),
+    "registration_pictures": of_registrations("registration.png"),
     "predictions": of_report(
         lambda name, method: [
             f"{take_run(name, take, method)}/prediction.json" for take in capture_named(name).takes
@@ -151,8 +151,8 @@ REPORTED = {
     ),
     "images": f"{RESULTS}/{{capture}}/{{method}}/images.json",
     "table": f"{RESULTS}/{{capture}}/{{method}}/images.csv",
-    "curves": f"{RESULTS}/{{capture}}/{{method}}/stress_curves.json",
-    "curves_picture": f"{RESULTS}/{{capture}}/{{method}}/stress_curves.png",
+    "curves": of_curves("stress_curves.json"),
+    "curves_picture": of_curves("stress_curves.png"),
     "identified": of_report(report_identified),
 }
 
@@ -175,6 +175,9 @@ rule capture_report:
         prior=PRIOR,
         constants=CONSTANTS,
         videos=of_capture(videos_of),
+        filmed=of_capture(body_videos_of),
+        motions=of_capture(take_titles),
+        objects=of_capture(lambda capture: list(object_reports(capture))),
         facts=of_report(report_facts),
     script:
         "../scripts/capture_report.py"

@@ -30,6 +30,35 @@ def take_run(name, take, method):
     return f"{RESULTS}/{scene}/{method}" + ("" if scene == training else f"+{LAW_FROM}={training}")
 
 
+def of_registrations(file):
+    """A function of wildcards: a file of each registration of their capture, in the order of `of_takes`."""
+    return of_capture(
+        lambda capture: [
+            f"{RESULTS}/{scene_name(capture.folder.name, take)}{f'_{part.body}' if part.body else ''}/{file}"
+            for part in parts_of(capture)
+            for take in part.takes
+        ]
+    )
+
+
+def object_reports(capture):
+    """Reports of the fits of Gaussians: of all bodies photographed together, and of each one photographed alone."""
+    files = {}
+    for part in parts_of(capture):
+        if part.body and part.source == part.name:
+            files[""] = f"{RESULTS}/{capture.folder.name}/whole.json"
+        else:
+            files[part.body or ""] = f"{RESULTS}/{part.source}/gaussians.json"
+    return files
+
+
+def of_curves(file):
+    """A function of wildcards: a file of the stress curves of their report. None for several bodies."""
+    return of_report(
+        lambda name, method: [] if capture_named(name).labels else f"{RESULTS}/{name}/{method}/{file}"
+    )
+
+
 @checked
 def capture_start(wildcards):
     """File of the initial motion of a take: of the method, or of the free flight where the take is held out."""
@@ -105,6 +134,8 @@ def report_cells(name, method):
 def report_identified(name, method):
     if CONSTANTS is None:
         return []
+    if capture_named(name).labels:
+        return f"{RESULTS}/{training_scene(name)}/identified.json"
     case = case_on(training_scene(name), CONSTANTS)
     return case.result(case.identified())
 
@@ -115,8 +146,11 @@ def report_facts(name, method):
     settings = capture.settings
     exposures = {camera: of.exposure for camera, of in settings.cameras.items()}
     return {
-        **{key: getattr(settings, key) for key in ("prior", "density", "scale", "dt", "width")},
-        "density_stated": "density" in settings.model_fields_set,
+        **{key: getattr(settings, key) for key in ("prior", "scale", "dt", "width")},
+        "densities": {
+            body: {"value": own.density, "stated": "density" in own.model_fields_set}
+            for body, own in (settings.bodies or {"": settings}).items()
+        },
         "held_out": list(settings.held_out),
         "throws": {
             take: {camera: exposures.get(camera, 0.0) for camera in cameras}

@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import numpy as np
+
 from neuma_lib.capture.calibration.lens import read_lens
 from neuma_lib.capture.frames import read_frames, read_timeline
 from neuma_lib.capture.masks.mattes import room_frames
@@ -13,7 +15,7 @@ from workflow.stage import run_script
 
 
 def main(inputs, output, params, run) -> None:
-    gains = read_json(inputs.registration)["gains"]
+    registrations = [read_json(file) for file in listed(inputs.registration)]  # of each body
     lenses = read_json(inputs.report)["lenses"]
     video = read_transforms(inputs.dynamic)["frames"]
     folder, entries = Path(output.transforms).parent, []
@@ -27,7 +29,8 @@ def main(inputs, output, params, run) -> None:
             (frame.number, undistorted(frame.pixels, lens, params.longest))
             for frame in read_frames(file, read_timeline(file, rate), numbers_of(video, camera))
         )
-        new = display_frames(folder, camera, video, mattes, frames, background, params.width, gains[camera])
+        gain = np.mean([each["gains"][camera] for each in registrations], axis=0)
+        new = display_frames(folder, camera, video, mattes, frames, background, params.width, gain.tolist())
         entries += new
         run.log(f"{camera}: {len(new)} frames")
     write_transforms(output.transforms, {}, entries)

@@ -19,34 +19,32 @@ def main(inputs, output, params, run) -> None:
     facts, method = params.facts, params.method
     released = "room" not in inputs.keys()  # released captures come with poses and masks
     videos = [tuple(video) for video in params.videos]
-    names, takes = [f"{take}, {camera}" for take, camera in videos], list(facts["throws"])
+    takes, motions = list(facts["throws"]), params.motions  # a motion is that of a body in a take
+    names, masks = ([f"{take}, {camera}" for take, camera in each] for each in (videos, params.filmed))
 
-    def by_take(files):
-        return dict(zip(takes, map(read_json, listed(files)), strict=True))
+    def named(titles, files):
+        return dict(zip(titles, map(read_json, listed(files)), strict=True))
 
-    def by_video(files):
-        return dict(zip(names, map(read_json, listed(files)), strict=True))
-
-    flights, registrations = by_take(inputs.flights), by_take(inputs.registrations)
-    predictions, rows = by_take(inputs.predictions), read_json(inputs.images)
-    curves = read_json(inputs.curves)
+    flights, registrations = named(motions, inputs.flights), named(motions, inputs.registrations)
+    predictions, rows = named(takes, inputs.predictions), read_json(inputs.images)
+    curves = read_json(inputs.curves) if inputs.curves else None
     identified = read_json(inputs.identified) if inputs.identified else None
     photographs = read_json(inputs.photographs)
     groups, pictures = {}, {}
     if not released:
-        groups["Frames, cameras, room"] = checks(read_json(inputs.room), by_video(inputs.timelines))
+        groups["Frames, cameras, room"] = checks(read_json(inputs.room), named(names, inputs.timelines))
         pictures["Cameras and room"] = {"Cameras and points": inputs.cameras, "Floor and box": inputs.floor}
         pictures["Videos"] = {f"Frames: {n}": file for n, file in zip(names, listed(inputs.frame_sheets))}
     groups |= {
-        "Masks and free flight": motion_checks(photographs, by_video(inputs.masks), flights),
-        "Gaussians of the object": object_checks(read_json(inputs.object)),
+        "Masks and free flight": motion_checks(photographs, named(masks, inputs.masks), flights),
+        "Gaussians of the object": object_checks(named(params.objects, inputs.objects)),
         "Registration": registration_checks(registrations),
     }
     filmed = {
         take: {
             "cameras": cameras,
-            "flight": flights[take],
-            "registration": registrations[take],
+            "flights": {m: flights[m] for m in motions if m.partition(", ")[0] == take},
+            "registrations": {m: registrations[m] for m in motions if m.partition(", ")[0] == take},
             "prediction": predictions[take],
         }
         for take, cameras in facts["throws"].items()
@@ -60,10 +58,12 @@ def main(inputs, output, params, run) -> None:
     ]
     pictures |= {
         "Photographs": {"Masks of the photographs": inputs.photograph_sheet},
-        "Masks of the videos": {f"Masks: {n}": file for n, file in zip(names, listed(inputs.mask_sheets))},
-        "Free flight": {f"Free flight: {t}": file for t, file in zip(takes, listed(inputs.flight_pictures))},
+        "Masks of the videos": {f"Masks: {n}": file for n, file in zip(masks, listed(inputs.mask_sheets))},
+        "Free flight": {
+            f"Free flight: {m}": file for m, file in zip(motions, listed(inputs.flight_pictures))
+        },
         "Registration": {
-            f"Registration: {t}": file for t, file in zip(takes, listed(inputs.registration_pictures))
+            f"Registration: {m}": file for m, file in zip(motions, listed(inputs.registration_pictures))
         },
     }
     means = {(row["throw"], row["camera"]): row for row in rows if row["method"] == method}
@@ -79,9 +79,13 @@ def main(inputs, output, params, run) -> None:
     ]
     cameras = {camera for filming in facts["throws"].values() for camera in filming}
     held = f", {', '.join(facts['held_out'])} held out" if facts["held_out"] else ""
+    densities = ", ".join(
+        f"{density['value']:g}" + (f" ({body})" if body else "")
+        for body, density in facts["densities"].items()
+    )
     summary = [
         f"{_counted(photographs['photographs'], 'photograph')}, {_counted(len(takes), 'take')}{held}, "
-        f"{_counted(len(cameras), 'camera')}. Prior: {facts['prior']}, density {facts['density']:g} kg/m³, "
+        f"{_counted(len(cameras), 'camera')}. Prior: {facts['prior']}, density {densities} kg/m³, "
         f"time step {1e3 * facts['dt']:g} ms, training pictures of {facts['width']} pixels."
     ]
     html = page(
@@ -94,7 +98,7 @@ def main(inputs, output, params, run) -> None:
         films=films,
         rows=rows,
         own=method,
-        curves=Path(inputs.curves_picture),
+        curves=Path(inputs.curves_picture) if inputs.curves_picture else None,
         identified=identified,
         scale=facts["scale"],
     )

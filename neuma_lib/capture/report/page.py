@@ -128,11 +128,17 @@ def gravity_checks(name: str, report: Mapping[str, Any]) -> list[Check]:
     ]
 
 
-def object_checks(fit: Mapping[str, Any]) -> list[Check]:
-    """Checks of the Gaussians fitted to the photographs, from the report of the fit."""
-    psnr = fit["psnr_object"]
-    text = f"{psnr:.1f} dB inside the object ({len(fit['held_out'])} photographs, {fit['count']} Gaussians)"
-    return [Check("PSNR of photographs kept from the fit", text, f"> {MIN_PSNR:g} dB", psnr > MIN_PSNR)]
+def object_checks(fits: Mapping[str, Mapping[str, Any]]) -> list[Check]:
+    """Checks of the Gaussians fitted to the photographs, from the report of each fit by name of the body, or ""."""
+    result = []
+    for body, fit in fits.items():
+        psnr = fit["psnr_object"]
+        text = (
+            f"{psnr:.1f} dB inside the object ({len(fit['held_out'])} photographs, {fit['count']} Gaussians)"
+        )
+        what = "PSNR of photographs kept from the fit" + (f", {body}" if body else "")
+        result.append(Check(what, text, f"> {MIN_PSNR:g} dB", psnr > MIN_PSNR))
+    return result
 
 
 def registration_checks(placed: Mapping[str, Mapping[str, Any]]) -> list[Check]:

@@ -15,7 +15,7 @@ from PIL import Image
 
 from neuma_lib.capture.pictures import read_picture
 from neuma_lib.capture.report.page import Check
-from neuma_lib.evaluation.calibration import describe_families, interval, kind_of
+from neuma_lib.evaluation.calibration import GRID, describe_families, interval, kind_of
 
 _PICTURE_WIDTH, _QUALITY = 1000, 80  # maximum width [px] and JPEG quality of pictures in the page
 STRESS_UNITS = {
@@ -77,7 +77,7 @@ def page(
         rows: measures, of `neuma_lib.capture.report.images.image_rows`.
         own: the learned method, whose rows are highlighted.
         curves: picture of the stress curves, if any.
-        identified: content of identified.json, if any.
+        identified: content of identified.json, if any, of one body or several.
         scale: simulated metres per metre of the room.
     """
     failed = sum(not check.good for group in checks.values() for check in group)
@@ -94,7 +94,8 @@ def page(
         headings=[heading for heading, _ in MEASURES.values()],
         places=_places(rows, own),
         curves=_uri(curves),
-        law=identified and _law(identified, scale),
+        laws=_laws(identified, scale) if identified else {},
+        frictions=[_friction(pair) for pair in (identified or {}).get("pairs", ())],
         warnings=warnings,
         checks=checks,
         pictures={
@@ -186,6 +187,24 @@ def _places(rows: Sequence[Mapping[str, Any]], own: str) -> list[dict[str, Any]]
         cells = [f"{row[key]:.{digits}f}" if key in row else "–" for key, (_, digits) in MEASURES.items()]
         place["rows"].append({"title": row["title"], "own": row["method"] == own, "cells": cells})
     return list(places.values())
+
+
+def _laws(identified: Mapping[str, Any], scale: float) -> dict[str, dict[str, Any]]:
+    """The identified law of each body by name, or of the only one, without a name."""
+    if "bodies" not in identified:
+        return {"": {**_law(identified, scale), "hidden": None}}
+    return {
+        body: {**_law(own, scale), "hidden": f"{100 * max(identified['hidden'][body]):.0f} %"}
+        for body, own in identified["bodies"].items()
+    }
+
+
+def _friction(pair: Mapping[str, Any]) -> dict[str, str]:
+    """The friction between two bodies."""
+    value = pair["friction"]
+    low, high = interval(value, pair["log_std"], quantity=GRID)
+    ends = "unknown" if high > _UNKNOWN * value else f"{number(low)} to {number(high)}"
+    return {"bodies": " and ".join(pair["bodies"]), "value": number(value), "interval": ends}
 
 
 def _law(identified: Mapping[str, Any], scale: float) -> dict[str, Any]:

@@ -30,24 +30,27 @@ def filming_warnings(capture: Mapping[str, Any], takes: Mapping[str, Mapping[str
     """Warnings about the set-up of the capture.
 
     Args:
-        capture: ``density`` [kg/m^3], ``density_stated``, ``scale``, and ``held_out``, names of takes.
-        takes: for each take ``cameras``, with the exposure of each [s], and the content of its files ``flight``,
-            ``registration`` and ``prediction`` (of the learned law).
+        capture: ``densities``, for each body by name, or "" for one, its ``value`` [kg/m^3] and whether it is
+            ``stated``, and ``held_out``, names of takes.
+        takes: for each take ``cameras``, with the exposure of each [s], ``flights`` and ``registrations``, the contents
+            of these files by title of the motion of a body, and that of ``prediction`` (of the learned law).
     """
     warnings = []
     for name, take in takes.items():
-        cameras, flight, motion = take["cameras"], take["flight"], take["prediction"]
+        cameras, flights, motion = take["cameras"], take["flights"], take["prediction"]
         if len(cameras) == 1:
             warnings.append(
                 f"{name}: there is only one camera. It hardly shows motion towards it, and the object is assumed to "
                 "fall above the middle of the box, in a plane that faces the camera."
             )
-        if flight.get("spin_rad_s") is None:
-            warnings.append(
-                f"{name}: no spin was measured in free flight, the object's surface has too little texture."
-            )
-        if reason := (take.get("registration") or {}).get("ambiguous"):
-            warnings.append(f"{name}: the flight does not determine the pose of the object: {reason}.")
+        for title, flight in flights.items():
+            if flight.get("spin_rad_s") is None:
+                warnings.append(
+                    f"{title}: no spin was measured in free flight, the object's surface has too little texture."
+                )
+        for title, placed in take.get("registrations", {}).items():
+            if reason := placed.get("ambiguous"):
+                warnings.append(f"{title}: the flight does not determine the pose of the object: {reason}.")
         unknown = [camera for camera, exposure in cameras.items() if not exposure]
         if unknown and motion.get("fastest_m_s"):
             smear = 1e3 * _BLUR * motion["fastest_m_s"]
@@ -56,8 +59,9 @@ def filming_warnings(capture: Mapping[str, Any], takes: Mapping[str, Mapping[str
                 f"speed of {motion['fastest_m_s']:.1f} m/s, an exposure of 1/1000 s blurs the object over {smear:.1f} "
                 "mm."
             )
-        delays = flight.get("row_delay_s") or {}
-        skew = {c: 1e3 * delay * (motion.get("fastest_m_s") or 0.0) for c, delay in delays.items()}
+        delays = [flight.get("row_delay_s") or {} for flight in flights.values()]
+        longest = {camera: max(each.get(camera, 0.0) for each in delays) for camera in cameras}
+        skew = {c: 1e3 * delay * (motion.get("fastest_m_s") or 0.0) for c, delay in longest.items()}
         if skewed := {camera: size for camera, size in skew.items() if size > _MAX_SKEW}:
             listed = ", ".join(f"{size:.1f} mm for {camera}" for camera, size in skewed.items())
             warnings.append(
@@ -76,9 +80,12 @@ def filming_warnings(capture: Mapping[str, Any], takes: Mapping[str, Mapping[str
                 f"{name}: the predicted object touches the box ({walls}), where the room has no wall. Set "
                 "scale or center in capture.yaml."
             )
-    if not capture["density_stated"]:
+    for body, density in capture["densities"].items():
+        if density["stated"]:
+            continue
+        of = f" of {body}" if body else ""
         warnings.append(
-            f"The density is the default, {capture['density']:g} kg/m³. Motion only determines the ratio of stress "
+            f"The density{of} is the default, {density['value']:g} kg/m³. Motion only determines the ratio of stress "
             "to density: if the object has twice the density, all stresses double. Weigh it, and set density in "
             "capture.yaml."
         )
@@ -151,26 +158,30 @@ def prediction_warnings(
 
 
 def constants_warnings(identified: Mapping[str, Any] | None) -> list[str]:
-    """Warnings about identified constants that the videos do not determine."""
+    """Warnings about identified constants, of one body or several, that the videos do not determine."""
     if not identified:
         return []
     warnings = []
-    if identified.get("ties"):
-        warnings.append(
-            f"The families {', '.join([identified['family'], *identified['ties']])} explain the video equally "
-            "well, so the family of the material is undetermined."
-        )
-    best = identified.get("material", identified["best"])
-    unknown = [name for name, entry in best["quantities"].items() if not entry["determined"]]
-    if unknown:
-        known = [name for name, entry in best["quantities"].items() if entry["determined"]]
-        rest = f" It determines {', '.join(known)}." if known else ""
-        warnings.append(
-            f"The video does not determine {', '.join(unknown)} of the identified law, whose values are close to "
-            f"those at the start of the search.{rest}"
-        )
-    if best.get("diverged"):
-        warnings.append("The motion of the identified law diverged during the search of its constants.")
+    for body, own in identified.get("bodies", {"": identified}).items():
+        start = f"{body}: " if body else ""
+        if own.get("ties"):
+            warnings.append(
+                f"{start}The families {', '.join([own['family'], *own['ties']])} explain the video equally "
+                "well, so the family of the material is undetermined."
+            )
+        best = own.get("material", own["best"])
+        unknown = [name for name, entry in best["quantities"].items() if not entry["determined"]]
+        if unknown:
+            known = [name for name, entry in best["quantities"].items() if entry["determined"]]
+            rest = f" It determines {', '.join(known)}." if known else ""
+            warnings.append(
+                f"{start}The video does not determine {', '.join(unknown)} of the identified law, whose values are "
+                f"close to those at the start of the search.{rest}"
+            )
+        if best.get("diverged"):
+            warnings.append(
+                f"{start}The motion of the identified law diverged during the search of its constants."
+            )
     return warnings
 
 
