@@ -166,7 +166,8 @@ def test_drawn_bodies_are_reconstructed_placed_and_identified(project):
         "1500 (clay), 1000 (gum)",
     ):
         assert part in text
-    assert "is missing" not in text and "The density of gum is the default" in text
+    assert "The video of" not in text and "picture is missing" not in text
+    assert "The density of gum is the default" in text
     for camera in ("left", "right"):
         assert read_json(root / f"{TAKE}/constants/views/{camera}.json")["mean"]["iou"] > 0.8
     for file in (root / "captures/pile/masks/first/left").iterdir():
