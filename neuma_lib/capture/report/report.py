@@ -202,9 +202,14 @@ def _laws(identified: Mapping[str, Any], scale: float) -> dict[str, dict[str, An
 def _friction(pair: Mapping[str, Any]) -> dict[str, str]:
     """The friction between two bodies."""
     value = pair["friction"]
-    low, high = interval(value, pair["log_std"], quantity=GRID)
-    ends = "unknown" if high > _UNKNOWN * value else f"{number(low)} to {number(high)}"
+    ends = _ends(value, pair["log_std"], GRID)
     return {"bodies": " and ".join(pair["bodies"]), "value": number(value), "interval": ends}
+
+
+def _ends(value: float, log_std: float, kind: str) -> str:
+    """The interval of a constant."""
+    low, high = interval(value, log_std, quantity=kind)
+    return "unknown" if high > _UNKNOWN * value else f"{number(low)} to {number(high)}"
 
 
 def _law(identified: Mapping[str, Any], scale: float) -> dict[str, Any]:
@@ -214,8 +219,7 @@ def _law(identified: Mapping[str, Any], scale: float) -> dict[str, Any]:
         value, unit = room_value(name, entry["value"], scale)
         prefix, unit = prefixed(value, unit)
         value *= prefix
-        low, high = interval(value, entry["log_std"], quantity=kind_of(identified))
-        ends = "unknown" if high > _UNKNOWN * value else f"{number(low)} to {number(high)}"
+        ends = _ends(value, entry["log_std"], kind_of(identified))
         text = f"{number(value)} {unit}".strip()
         constants.append({"name": name, "value": text, "interval": ends, "determined": entry["determined"]})
     if (lowest := identified.get("contact_friction", {}).get("at_least")) is not None:
