@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,33 +9,18 @@ import pytest
 import torch
 import trimesh
 
-from neuma_lib.config.identify import IdentifyConfig
-from neuma_lib.config.laws import LawConfig
 from neuma_lib.config.training import TrainingConfig
 from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.errors import NonFiniteError
-from neuma_lib.fitting import identify as identification
-from neuma_lib.fitting.families import MAX_COURANT, Family
+from neuma_lib.fitting.families import Family
 from neuma_lib.fitting.family_run import FamilyRun
 from neuma_lib.fitting.frame_batches import check_contact, first_contact
-from neuma_lib.fitting.identified import FamilyFit, Identified
-from neuma_lib.fitting.identify import _better_later, _first_fit, _prune, identify, select_family
-from neuma_lib.fitting.least_squares import (
-    BLOCKS,
-    Linearisation,
-    block_sums,
-    in_blocks,
-    jackknife,
-    laplace,
-    levenberg_marquardt,
-    secant_update,
-)
+from neuma_lib.fitting.identify import identify
 from neuma_lib.fitting.video_residuals import Candidate, VideoResiduals, averaged, finer
 from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.io.files import write_json
 from neuma_lib.mechanics.analytic import analytic_law
-from neuma_lib.mechanics.catalogue import COURANT_LIMIT
-from neuma_lib.mechanics.combinations import named_combinations, physical
+from neuma_lib.mechanics.combinations import named_combinations
 from neuma_lib.methods.base import Problem
 from neuma_lib.methods.spring_gaus.method import SpringGaus
 from neuma_lib.methods.training import Training
@@ -47,54 +31,26 @@ from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 from neuma_lib.splatting.observation import Observation
 from neuma_lib.threads import use_threads
-from tests.support import grounding_scene
 from tests.support.errors import refused
 from tests.support.grounding_scene import MODEL, RADIUS, camera, observe
+from tests.support.identification import (
+    ELASTIC,
+    FLUID,
+    FRAMES,
+    HEIGHT,
+    PLASTIC,
+    SQUARES,
+    V0,
+    ball,
+    identified_in,
+    known,
+    pixel_noise,
+    settings,
+    video_of,
+)
 from tests.support.sim_scenes import law_spec as law
 
 pytestmark = pytest.mark.core
-
-HEIGHT = 0.27
-"""Of the ball's centre, so that it rests on the floor long enough for three held-out frames."""
-ball = partial(grounding_scene.ball, height=HEIGHT)
-V0 = (0.5, -1.5, 0.0)
-FRAMES = tuple(range(0, 121, 8))
-SQUARES = (4, 8, 32)
-DENSITY = 1000.0
-
-ELASTIC = law("hencky")
-PLASTIC = law("hencky", "von_mises", yield_stress=4e3)
-FLUID = law("hencky", "viscous_flow", viscosity=60)
-
-
-def settings(families: dict, **options) -> IdentifyConfig:
-    families = {name: LawConfig(**spec) for name, spec in families.items()}
-    return IdentifyConfig(families=families, **{"pyramid": SQUARES, "pose_tolerance": 0.0, **options})
-
-
-def pixel_noise(images: torch.Tensor) -> torch.Tensor:
-    return 0.01 * torch.randn(images.shape, generator=torch.Generator().manual_seed(5), dtype=images.dtype)
-
-
-def known(body, std=(0.0,) * 6, v0=V0) -> InitialMotion:
-    """The true initial motion, up to standard deviations."""
-    centre = (body.mass @ body.x0 / body.mass.sum()).numpy()
-    return InitialMotion(np.array(v0), np.zeros(3), centre, np.eye(3), np.array(std))
-
-
-def identified_in(spec: dict, families: dict, noise=pixel_noise, motion=None, **options):
-    """What is identified in a noisy video of the ball under a law."""
-    body, seen = video_of(spec, V0, FRAMES, noise)
-    other_videos = options.pop("other_videos", ())
-    chosen = settings(families, covariance_from="elastic", **options)
-    return identify(MODEL, motion or known(body), body, seen, chosen, other_videos=other_videos)
-
-
-def video_of(spec: dict, v0, frames, noise=pixel_noise):
-    """The ball, and a noisy video of it under a law."""
-    body = ball()
-    seen = observe(body, v0, frames, spec)
-    return body, Observation(seen.frames, seen.images + noise(seen.images), seen.cameras)
 
 
 def test_constants_and_family_of_the_truth_are_identified():
@@ -392,62 +348,6 @@ def test_steps_of_the_model_are_whole_steps_of_the_finer_grid(steps, substeps):
     assert all(abs(n * MODEL.dt / fine.dt - round(n * MODEL.dt / fine.dt)) < 1e-9 for n in steps)
 
 
-@pytest.mark.parametrize("refinement", [1.5, 2])
-def test_an_extrapolation_covers_both_orders_of_convergence(refinement):
-    """Errors of log E that are proportional to dx^2 vanish, those that are proportional to dx are one standard
-    deviation."""
-    family = Family("hencky", ELASTIC)
-
-    def fit(log_error, covariance=None):
-        return FamilyFit(family, {"E": 1e5 * math.exp(log_error), "nu": 0.3}, covariance=covariance)
-
-    for order, deviations in ((1, 1.0), (2, 0.0)):
-        fine = fit(0.1 / refinement**order, 1e-6 * np.eye(2)).extrapolated(fit(0.1), refinement, 4)
-        error, std = math.log(fine.values["E"] / 1e5), math.sqrt(fine.covariance[0, 0] - 1e-6)
-        assert abs(error) == pytest.approx(deviations * std, rel=1e-6, abs=1e-9) and std > 1e-3
-        assert fine.values["nu"] == pytest.approx(0.3) and fine.covariance[1, 1] == pytest.approx(1e-6)
-    vague = np.array([[0.5, 1e-5], [1e-5, 1e-8]])
-    joined = fit(0.0, 1e-6 * np.eye(2)).extrapolated(fit(0.0, vague), refinement, 4).covariance
-    assert all(np.linalg.eigvalsh(joined - each).min() > -1e-12 for each in (vague, 1e-6 * np.eye(2)))
-    assert np.trace(joined) < np.trace(vague) + 3e-6, "the larger of both, not their sum"
-    far = fit(-math.log(9), 1e-6 * np.eye(2)).extrapolated(fit(0.0), refinement, 4)
-    limited = -math.log(9) - math.log(2) / (refinement**2 - 1)
-    assert math.log(far.values["E"] / 1e5) == pytest.approx(limited)
-    assert far.covariance[0, 0] > 0.5 * (math.log(9) / refinement) ** 2
-
-
-def test_more_particles_on_the_same_grid_are_not_extrapolated():
-    """The remaining error, if it is proportional to the inverse of the number, is one standard deviation."""
-    family = Family("hencky", ELASTIC)
-
-    def fit(count):
-        values = {"E": 1e5 * math.exp(0.4 * 1000 / count), "nu": 0.3}
-        return FamilyFit(family, values, covariance=1e-6 * np.eye(2))
-
-    material = fit(4000).extrapolated(fit(1000), 1.0, 4)
-    assert material.values == pytest.approx(fit(4000).values)
-    assert math.sqrt(material.covariance[0, 0] - 1e-6) == pytest.approx(0.1)
-
-
-def test_a_constant_at_its_bound_leaves_uncertain_what_depends_on_it():
-    """Poisson's ratio next to 0, where its logit is uncertain by 5, may be up to 0.11: the moduli from draws."""
-    family, std = Family("hencky", ELASTIC), 5.0
-    fit = FamilyFit(family, {"E": 1e5, "nu": 0.001}, covariance=np.diag([1e-6, std**2]))
-    names, covariance = fit.log_covariance(physical)
-    u = family.unbounded(fit.values)
-    draws = [family.bounded(u + [0, std * z]) for z in np.random.default_rng(0).standard_normal(20_000)]
-    for name, variance in zip(names, np.diag(covariance), strict=True):
-        low, high = np.quantile([math.log(physical(values)[name]) for values in draws], [0.159, 0.841])
-        assert math.sqrt(variance) > 0.04 and math.sqrt(variance) == pytest.approx((high - low) / 2, rel=0.1)
-    sure = FamilyFit(family, {"E": 1e5, "nu": 0.3}, covariance=1e-6 * np.eye(2))
-    E, G, K = (
-        sure.log_covariance(lambda v, key=key: {key: {**v, **physical(v)}[key]})[1][0, 0] for key in "EGK"
-    )
-    slope = 0.3 * (1 - 0.3 / 0.5)  # of nu by its logit
-    assert E == pytest.approx(1e-6) and G == pytest.approx(1e-6 * (1 + (slope / 1.3) ** 2), rel=1e-4)
-    assert K == pytest.approx(1e-6 * (1 + (2 * slope / 0.4) ** 2), rel=1e-4)
-
-
 def test_a_motion_is_read_moved_and_written():
     """Deviations along the camera's axes are those of the world turned; what is known does not move."""
     axes = [[0, 0, 1], [0, -1, 0], [1, 0, 0]]
@@ -464,88 +364,6 @@ def test_a_motion_is_read_moved_and_written():
     body = ball()
     around = np.cross(moved.spin, body.x0.numpy() - moved.centre)
     np.testing.assert_allclose(moved.of_body(body).v, moved.velocity + around)
-
-
-class FakeRun:
-    """The attributes of a fit that `_prune` reads: squared residuals, family, and an image."""
-
-    alive = True
-
-    def __init__(self, cost, spec, picture):
-        self.fit = Linearisation(np.zeros(0), np.zeros(0), cost, 0.0)
-        self.family, self.picture = Family("x", spec), picture
-
-    def resembles(self, other):
-        return self.picture == other.picture
-
-
-def test_families_with_a_high_cost_and_redundant_ones_are_pruned():
-    """Families that are merely no better in blurred images are kept, with more constants, of another elasticity, or
-    with flow that a contained soft body also reproduces."""
-    options = settings({"hencky": ELASTIC}, prune_factor=3.0)
-    elastic, far = FakeRun(1.0, ELASTIC, "soft"), FakeRun(3.1, law("neo_hookean"), "far")
-    never_yields, flat = FakeRun(0.99, PLASTIC, "soft"), FakeRun(1.2, FLUID, "flat")
-    sibling = FakeRun(1.0, law("fixed_corotated"), "soft")
-    runs = [elastic, far, never_yields, flat, sibling]
-    _prune(runs, options, keep_redundant=True)
-    assert [run.alive for run in runs] == [True, False, True, True, True]
-    _prune(runs, options)
-    assert [run.alive for run in runs] == [True, False, False, True, True]
-    grains = FakeRun(1.0, law("hencky", "drucker_prager", friction_angle=30), "soft")
-    _prune([elastic, grains], options)
-    assert grains.alive, "sand does not contain the elastic body"
-    clay, stiffer = FakeRun(2.9, PLASTIC, "clay"), FakeRun(8.8, PLASTIC, "stiffer")
-    mud = FakeRun(9.1, law("hencky", "viscous_flow", viscosity=50), "mud")
-    _prune([elastic, clay, stiffer, mud], options)
-    assert elastic.alive and clay.alive and not stiffer.alive, (
-        "return maps are compared by the square of the factor"
-    )
-    assert not mud.alive
-    uneven = FakeRun(0.2, {**ELASTIC, "field": {"name": "ramp", "ratio": 1.0}}, "uneven")
-    _prune([elastic, sibling, uneven], options)
-    assert elastic.alive and not sibling.alive, "the uniform family of a field is kept, no other"
-
-
-def test_fits_restart_from_better_ones_that_started_later():
-    """From the best of all, and the best one with the same constants, since a flow may lead with constants that suit no
-    elastic body."""
-    stuck, elastic = FakeRun(9.0, ELASTIC, "stuck"), FakeRun(2.0, law("fixed_corotated"), "soft")
-    worse, flow = FakeRun(3.0, law("neo_hookean"), "soft"), FakeRun(1.0, PLASTIC, "flows")
-    pairs = _better_later([stuck, elastic, worse, flow])
-    assert pairs == [(stuck, flow), (stuck, elastic), (elastic, flow), (worse, flow)]
-    stuck.alive = flow.alive = False
-    assert _better_later([stuck, elastic, worse, flow]) == []
-
-
-def test_a_fit_restarts_from_the_best_constants_if_they_are_better():
-    """A flow that starts beyond its yield stress never yields: a local minimum that other limits leave."""
-    body, seen = video_of(PLASTIC, V0, FRAMES)
-    chosen = settings({"plastic": PLASTIC}, covariance_from="elastic", refined_particles=0, iterations=3)
-    video, family = VideoResiduals(MODEL, known(body), body, seen, chosen), Family("plastic", PLASTIC)
-    stuck = family.with_guesses({"yield_stress": 1e6})
-    run = FamilyRun(family, [video], [len(FRAMES)], chosen)
-    run.begin([stuck])
-    before = run.fit.cost
-    run.restart_from([stuck, *family.with_other_limits(stuck, (1, 2))])
-    assert run.fit.cost == before, "no start is better"
-    run.restart_from([stuck, *family.with_other_limits(stuck, (-4, -2))])
-    assert run.fit.cost < 0.5 * before and run.values["yield_stress"] < 1e5
-
-
-def test_a_flow_that_never_yields_shows_the_elastic_body():
-    """And one that yields does not, whatever their squared residuals."""
-    body, seen = video_of(ELASTIC, V0, FRAMES)
-    chosen = settings({"hencky": ELASTIC}, covariance_from="elastic", refined_particles=0)
-    video = VideoResiduals(MODEL, known(body), body, seen, chosen)
-    runs = [
-        FamilyRun(Family("x", spec), [video], [len(FRAMES)], chosen) for spec in (ELASTIC, PLASTIC, PLASTIC)
-    ]
-    for run, limit in zip(runs, (1.0, 1e5, 1e3), strict=True):
-        values = run.family.with_guesses({"yield_stress": limit})
-        run._origin = run.family.unbounded(values)
-        run.fit = Linearisation(np.zeros(0), np.zeros(0), run.cost(run._u), 0.0)
-    elastic, never_yields, yields = runs
-    assert never_yields.resembles(elastic) and not yields.resembles(elastic)
 
 
 def test_number_of_threads_changes_no_bit_of_the_residuals():
@@ -603,53 +421,6 @@ def test_frames_after_the_contact_decide():
         assert len(FRAMES) - video.fitted == round(share * informative)
 
 
-def test_what_parts_of_the_video_and_tied_families_disagree_about_is_uncertain():
-    """The change since the fit to the first frames, and the scatter of shared constants over families that are as good,
-    are uncertain; what is not shared is not."""
-    family, other = Family("plastic", PLASTIC), Family("elastic", law("neo_hookean"))
-    values = {"E": 6e4, "nu": 0.3, "yield_stress": 4e3}
-    first = FamilyFit(family, {**values, "E": 5e4})
-    fit = FamilyFit(family, values)
-    alone = fit.disagreement(first, [])
-    np.testing.assert_allclose(np.sqrt(np.diag(alone)), [math.log(6 / 5), 0, 0], atol=1e-12)
-    tied = alone + fit.disagreement(fit, [FamilyFit(other, {"E": 12e4, "nu": 0.3})])
-    expected = [math.hypot(math.log(6 / 5), math.log(2) / math.sqrt(2)), 0, 0]
-    np.testing.assert_allclose(np.sqrt(np.diag(tied)), expected, atol=1e-12)
-
-
-@pytest.mark.parametrize("flat", [1.0, 4.0, math.inf])
-def test_a_plateau_widens_what_is_not_determined(flat):
-    """Squared residuals that rise so many times less on one side than their quadratic: so much larger is the variance,
-    up to that of the spread. A determined axis costs no simulation."""
-    chosen, curvature = settings({"hencky": ELASTIC}, spread=2.0, determined=0.1), np.diag([1e4, 5.0])
-    run = FamilyRun(Family("hencky", ELASTIC), [SimpleNamespace(deviations=9)], [0], chosen)
-    run.fit, tried = Linearisation(np.pad(curvature, (0, 9))[None], np.zeros((1, 11)), 1.0, 1.0), []
-    run._covariance = lambda: np.diag([1e-4, 0.25] + [0.0] * 9)
-
-    def cost(u):
-        tried.append(u)
-        return 1.0 + u @ run.fit.curvature @ u / (flat if u[1] > 0 else 1.0)
-
-    run._simulate, run._cost = lambda points: points, cost
-    added = run.covariance_of_plateaus()
-    np.testing.assert_allclose(added, np.diag([0.0, min(0.25 * flat, 4.0) - 0.25]), atol=1e-9)
-    assert len(tried) == 2 and all(abs(u[1]) == pytest.approx(1.0) for u in tried)
-
-
-@pytest.mark.parametrize("level", [False, True])
-def test_a_fit_that_ends_before_the_minimum_of_a_quadratic_is_on_no_plateau(level):
-    """It is 0.8 of the step away, where the cost on one side is hardly higher. Above the slope it is the quadratic."""
-    chosen = settings({"hencky": ELASTIC}, spread=2.0, determined=0.1, level_plateaus=level)
-    run = FamilyRun(Family("hencky", ELASTIC), [SimpleNamespace(deviations=9)], [0], chosen)
-    H, away = np.pad(np.diag([1e4, 5.0]), (0, 9)), np.eye(11)[1] * 0.4
-    run.fit = Linearisation(H[None], np.zeros((1, 11)), away @ H @ away, 1.0)
-    run._covariance = lambda: np.diag([1e-4, 0.25] + [0.0] * 9)
-    run._simulate, run._cost = lambda points: points, lambda u: (u - away) @ H @ (u - away)
-    added = run.covariance_of_plateaus()
-    # The step is 1: (1 - 0.4)^2 - 0.4^2 = 0.2 of the quadratic.
-    np.testing.assert_allclose(added, np.diag([0.0, 0.0 if level else 0.25 / 0.2 - 0.25]), atol=1e-9)
-
-
 def test_a_plastic_body_is_no_elastic_one_and_is_pictured(tmp_path):
     truth = law("hencky", "von_mises", E=6e4, nu=0.3, yield_stress=2e3)
     identified = identified_in(truth, {"hencky": ELASTIC, "von_mises": PLASTIC})
@@ -703,170 +474,6 @@ def test_a_family_that_diverges_loses_and_alone_is_an_error(monkeypatch):
         identified_in(truth, {"neo_hookean": wild})
 
 
-def fits(**scores: float) -> list[FamilyFit]:
-    specs = {
-        "hencky": ELASTIC,
-        "von_mises": PLASTIC,
-        "drucker_prager": law("hencky", "drucker_prager", friction_angle=30),
-        "neo_hookean": law("neo_hookean"),
-    }
-    return [FamilyFit(Family(name, specs[name]), {}, score=score) for name, score in scores.items()]
-
-
-def test_near_scores_are_ties_unless_one_family_contains_the_chosen_one():
-    options = settings({"hencky": ELASTIC}, tie=0.1)
-    best, ties = select_family(
-        fits(hencky=-8.0, von_mises=-7.95, neo_hookean=-7.95, drucker_prager=-7.8), options
-    )
-    assert best.family.name == "hencky" and ties == ["neo_hookean"]
-    best, ties = select_family(fits(hencky=-7.95, von_mises=-8.0), options)
-    assert best.family.name == "von_mises" and ties == ["hencky"]
-    with pytest.raises(NonFiniteError, match="every candidate"):
-        select_family(fits(hencky=math.inf), options)
-
-
-def test_nesting_of_families():
-    bingham = Family("bingham", law("hencky", "viscous_flow", viscosity=50, yield_stress=1e3))
-    elastic, plastic, fluid = (Family("x", spec) for spec in (ELASTIC, PLASTIC, FLUID))
-    grains = Family("x", law("hencky", "drucker_prager", friction_angle=30))
-    assert bingham.contains(plastic) and bingham.contains(fluid) and bingham.contains(elastic)
-    assert plastic.contains(elastic) and not plastic.contains(fluid) and not plastic.contains(plastic)
-    assert not grains.contains(elastic), "sand bears no tension, whatever its friction"
-    assert not plastic.contains(Family("x", law("neo_hookean")))
-
-
-def test_stiffness_that_the_time_step_does_not_bear_has_a_difference_too():
-    """At the stiffest that dt bears no small step changes the law: the difference is taken over a long one."""
-    body, seen = video_of(ELASTIC, V0, FRAMES)
-    chosen = settings({"hencky": ELASTIC}, covariance_from="elastic", refined_particles=0)
-    video, family = VideoResiduals(MODEL, known(body), body, seen, chosen), Family("hencky", ELASTIC)
-    run = FamilyRun(family, [video], [len(FRAMES)], chosen)
-    run._origin = family.unbounded({"E": 1e9, "nu": 0.3})
-    run._u[0] = math.log(run.values["E"] / 1e9) + 0.5  # beyond the limit by more than a small step
-    here = run._residual(run._u)
-    by_stiffness, by_nu = run._constant_columns(run._u, here)
-    assert by_stiffness[0].abs().max() > 0 and by_nu[0].isfinite().all()
-
-
-def test_unbounded_constants_return_and_stay_within_bounds_and_the_time_step():
-    family = Family("grains", law("hencky", "drucker_prager", E=3e4, nu=0.2, friction_angle=40))
-    values = {"E": 3e4, "nu": 0.2, "friction_angle": 40.0}
-    assert family.bounded(family.unbounded(values)) == pytest.approx(values, rel=1e-12)
-    for far in (-100.0, 100.0):
-        values = family.values(np.array([abs(far), far, far]), MODEL, DENSITY)
-        assert 0 < values["nu"] < 0.5 and 0 < values["friction_angle"] < 90
-        number = MODEL.check_courant(analytic_law(family.law_spec(values)), DENSITY)
-        assert number == pytest.approx(MAX_COURANT, rel=1e-3) or values["E"] < 1e-3
-        assert MAX_COURANT < 0.9 * COURANT_LIMIT, "a correction may stiffen the law by a fifth"
-
-
-def test_constants_between_any_bounds_are_unbounded_and_return():
-    """Also those whose lower bound is not 0: exponents from 0.2, angles from -180 degrees."""
-    flow = {"name": "herschel_bulkley", "consistency": 8.0, "exponent": 2.0, "yield_stress": 30.0}
-    fibres = {"name": "fibre_reinforced", "E": 3e4, "nu": 0.2, "fibre_modulus": 1e5, "fibre_exponent": 2.0}
-    paste = Family("paste", {"elasticity": {"name": "hencky", "E": 3e4, "nu": 0.2}, "plasticity": flow})
-    tendon = Family("tendon", {"elasticity": {**fibres, "azimuth": -120.0, "elevation": 25.0}})
-    for family, low, high in (
-        (paste, {"exponent": 0.2}, {"exponent": 3.0}),
-        (tendon, {"azimuth": -180.0}, {}),
-    ):
-        u = family.unbounded(family.guess)
-        assert family.bounded(u) == pytest.approx(family.guess, rel=1e-12)
-        for bounds, far in ((low, -100.0), (high, 100.0)):
-            values = family.bounded(np.where([key in bounds for key in family.constants], far, u))
-            assert {key: values[key] for key in bounds} == pytest.approx(bounds, rel=1e-4)
-
-
-def test_less_flow_is_towards_the_elastic_limit_and_within_bounds():
-    values = {"E": 3e4, "nu": 0.2}
-    family = Family("plastic", law("hencky", "von_mises", yield_stress=4e3))
-    result = family.with_other_limits({**values, "yield_stress": 1e3}, (1, 2))
-    assert [v["yield_stress"] for v in result] == pytest.approx([4e3, 1.6e4])
-    assert all(v["E"] == pytest.approx(3e4) and v["nu"] == pytest.approx(0.2) for v in result)
-    grains = Family("grains", law("hencky", "drucker_prager", friction_angle=30))
-    angles = [
-        v["friction_angle"] for v in grains.with_other_limits({**values, "friction_angle": 30.0}, (1, 2))
-    ]
-    assert 30 < angles[0] < angles[1] < 90
-    assert Family("elastic", ELASTIC).with_other_limits(values, (1, 2)) == []
-
-
-def test_a_plastic_family_starts_from_weak_flow_and_from_fits_of_others(monkeypatch):
-    """From its guesses and weaker limits of the last one, and from an elastic fit, then nearer to its elastic limit."""
-    starts = []
-
-    class Run(SimpleNamespace):
-        alive = True
-
-        def resembles(self, other):
-            return False
-
-        def begin(self, given, below):
-            starts.append([(values["E"], values["yield_stress"]) for values in given])
-
-    fit = SimpleNamespace(cost=1.0)
-    monkeypatch.setattr(
-        identification, "FamilyRun", lambda family, *given: Run(family=family, fit=fit, loss=1.0, rollouts=1)
-    )
-    elastic = Run(family=Family("elastic", ELASTIC), fit=fit, values={"E": 5e4, "nu": 0.2})
-    family = Family("plastic", law("hencky", "von_mises", E=3e4, nu=0.3, yield_stress=4e3))
-    published = {"E": 6e4, "nu": 0.3, "yield_stress": 8e3}
-    best = _first_fit(family, [], [elastic], published, settings({"elastic": ELASTIC}))
-    (first, second), guess = starts, (3e4, 4e3)
-    assert first == [pytest.approx(each) for each in (guess, (6e4, 8e3), (6e4, 2e3), (6e4, 500.0))]
-    limit = second[0][1]  # the elastic fit is the best one, and that of a family that this one contains
-    assert second == [pytest.approx((5e4, factor * limit)) for factor in (1, 1, 4, 16)]
-    assert best.rollouts == 2
-
-
-def test_a_published_law_gives_what_the_family_has():
-    family = Family("plastic", PLASTIC)
-    known = {"E": 1e5, "nu": -0.2, "friction_angle": 25.0}
-    assert family.with_guesses(known) == {"E": 1e5, "nu": 0.3, "yield_stress": 4e3}
-    bounds = {"E": 0.0, "nu": 0.0, "yield_stress": 0.0}  # have no logarithm or logit
-    assert family.with_guesses(bounds) == family.with_guesses({})
-
-
-def test_combinations_are_those_of_the_covariance():
-    """Of a body whose E is open and nu sure, the ratio of both moduli is determined and their product is not."""
-    family = Family("hencky", ELASTIC)
-    fit = FamilyFit(family, {"E": 6e4, "nu": 0.3}, covariance=np.diag([0.25, 1e-12]))
-    options = settings({"hencky": ELASTIC}, model_std=0.02)
-    first, second = fit.combinations(options)
-    assert first["determined"] and not second["determined"]
-    assert second["powers"]["G"] == pytest.approx(second["powers"]["K"], abs=1e-4)  # log E moves both alike
-    assert second["log_std"] == pytest.approx(math.sqrt(2) * 0.5, rel=1e-2)
-    (_, E, std), *_ = fit.quantities(options)
-    assert E == 6e4 and std == pytest.approx(0.5, rel=1e-2)
-
-
-def test_errors_that_all_images_share_are_part_of_every_uncertainty():
-    """Images without any error leave `model_std`."""
-    family, start = Family("hencky", ELASTIC), known(ball())
-    fit = FamilyFit(family, {"E": 6e4, "nu": 0.3}, 1.0, covariance=np.zeros((2, 2)), motions=(start,))
-    options = settings({"hencky": ELASTIC}, model_std=0.07)
-    assert [std for *_, std in fit.quantities(options)] == pytest.approx(
-        [0.07] * len(fit.quantities(options))
-    )
-    assert [each["log_std"] for each in fit.combinations(options)] == pytest.approx([0.07, 0.07])
-    stds = [each["log_std"] for each in fit.as_dict(options)["quantities"].values()]
-    assert stds == pytest.approx([0.07] * len(stds))
-
-
-def test_the_laplace_approximation_is_the_covariance_for_independent_noise():
-    """Of a linear problem with the prior, against the normal equations written out, and against many noisy problems."""
-    generator, sigma, spreads = np.random.default_rng(0), 0.3, np.array([2.0, 0.5, 1.0])
-    J = generator.standard_normal((400, 3))
-    truth = spreads * generator.standard_normal((500, 3))
-    residuals = truth @ J.T + sigma * generator.standard_normal((500, 400))
-    precision = J.T @ J / sigma**2 + np.diag(spreads**-2.0)
-    fit = Linearisation((J.T @ J)[None], np.zeros((1, 3)), 400 * sigma**2, sigma)
-    covariance = laplace(fit, spreads)
-    np.testing.assert_allclose(covariance, np.linalg.inv(precision), rtol=1e-10)
-    errors = residuals @ J @ covariance / sigma**2 - truth
-    np.testing.assert_allclose(errors.std(axis=0), np.sqrt(np.diag(covariance)), rtol=5 * 500**-0.5)
-
-
 def test_an_identification_records_the_laplace_approximation_and_comparable_scores():
     """With residuals of one pixel noise it is smaller than the jackknife, which includes more."""
     families = {"hencky": ELASTIC, "neo_hookean": law("neo_hookean")}
@@ -878,19 +485,6 @@ def test_an_identification_records_the_laplace_approximation_and_comparable_scor
     assert plain.shape == whole.shape and (np.diag(plain) > 0).all()
     assert 0 < own["quantities"]["E"]["laplace_log_std"] < own["quantities"]["E"]["log_std"]
     assert own["quantities"]["E"]["laplace_log_std"] == pytest.approx(plain[0, 0] ** 0.5, rel=1e-3)
-
-
-def test_a_summary_lists_what_is_determined_and_what_is_not():
-    family = Family("plastic", PLASTIC)
-    values = {"E": 6e4, "nu": 0.3, "yield_stress": 4e3}
-    fit = FamilyFit(family, values, 1.0, covariance=np.diag([0.25, 1e-8, 1e-8]))
-    options = settings({"hencky": ELASTIC})
-    text = Identified(fit, ["other"], {}, [], [], 0, 24, options).summary()
-    assert text.startswith("plastic (tie with other): E = 6e+04, nu = 0.3, yield_stress = 4000; determined: ")
-    determined, rest = text.partition("; determined: ")[2].split("; not determined: ")
-    assert "yield_stress" in determined.split(", ") and "E" in rest.split(", ")
-    sure = replace(fit, covariance=1e-8 * np.eye(3))
-    assert "not determined" not in Identified(sure, [], {}, [], [], 0, 24, options).summary()
 
 
 def test_images_are_averaged_over_squares():
@@ -953,111 +547,3 @@ def test_a_turning_body_touches_the_floor_where_one_without_spin_does_not():
     check_contact(model, [(still, (0, 100)), (turning, (0, 100))])  # the other video shows the material
     with refused("frames", problem="first contact is missing"):
         check_contact(model, [(still, (0, 100))])
-
-
-class Line:
-    """Residuals a u - b of one frame, with sign changes of u beyond a wall."""
-
-    def __init__(self, a: np.ndarray, b: np.ndarray, wall: float = math.inf):
-        self.a, self.b, self.wall = a, b, wall
-
-    def cost(self, u):
-        return math.inf if u[0] > self.wall else float(((self.a @ u - self.b) ** 2).sum())
-
-    def linearise(self, u, free, exact=True):
-        r = self.a @ u - self.b
-        columns = self.a.reshape(16, -1, self.a.shape[1])
-        scores = (columns.transpose(0, 2, 1) @ r.reshape(16, -1, 1))[..., 0]
-        return Linearisation(
-            columns.transpose(0, 2, 1) @ columns, scores, float(r @ r), float(np.sqrt(r @ r))
-        )
-
-
-class Bend:
-    """Residuals of exp(u_0), u_0 + u_1 and 0.1 u_1 to targets, with updated derivatives unless they must be exact."""
-
-    def __init__(self, targets: np.ndarray):
-        self.targets, self.differentiated, self.at, self.J = targets, 0, None, None
-
-    def residual(self, u):
-        return np.array([np.exp(u[0]), u[0] + u[1], 0.1 * u[1]]) - self.targets
-
-    def cost(self, u):
-        return float((self.residual(u) ** 2).sum())
-
-    def linearise(self, u, free, exact=True):
-        r, known = self.residual(u), self.at is not None
-        if exact or not known:
-            self.J = np.array([[np.exp(u[0]), 0.0], [1.0, 1.0], [0.0, 0.1]])
-            self.differentiated += 1
-        elif (step := u - self.at).any():
-            change = torch.from_numpy(r - self.residual(self.at) - self.J @ step)
-            columns = secant_update(list(torch.from_numpy(self.J.T.copy())), step.tolist(), change)
-            self.J = torch.stack(columns, dim=1).numpy()
-            np.testing.assert_allclose(self.J @ step, r - self.residual(self.at), atol=1e-12)
-        self.at = u.copy()
-        exact = exact or not known
-        return Linearisation((self.J.T @ self.J)[None], (self.J.T @ r)[None], self.cost(u), 1.0, exact)
-
-
-def test_updated_derivatives_reach_the_same_minimum_with_fewer_differentiations():
-    none = lambda fit: np.zeros((2, 2))  # noqa: E731
-    targets, results, counts = np.array([3.0, 0.5, 0.2]), [], []
-    for secant in (False, True):
-        problem = Bend(targets)
-        u, fit, _ = levenberg_marquardt(problem, np.zeros(2), [0, 1], none, 1e-14, 40, secant=secant)
-        assert fit.exact and np.abs(fit.slope).max() < 1e-5
-        results.append(u)
-        counts.append(problem.differentiated)
-    np.testing.assert_allclose(*results, atol=1e-5)
-    assert counts[1] < counts[0]
-
-
-def test_a_rough_fit_and_a_hopeless_one_differentiate_less():
-    """A rough fit ends with updated derivatives near the minimum, one beyond the limit of the cost at once."""
-    none = lambda fit: np.zeros((2, 2))  # noqa: E731
-    targets = np.array([3.0, 0.5, 0.2])
-    problem = Bend(np.array([3.0, 0.5, 0.2]))
-    hopeless = Bend(np.array([3.0, 0.5, 9.0]))
-    exact, _, _ = levenberg_marquardt(Bend(targets), np.zeros(2), [0, 1], none, 1e-14, 40)
-    u, fit, _ = levenberg_marquardt(problem, np.zeros(2), [0, 1], none, 1e-6, 40, secant=True, rough=True)
-    assert not fit.exact and problem.differentiated == 1
-    np.testing.assert_allclose(u, exact, atol=0.02)
-    u, fit, accepted = levenberg_marquardt(
-        hopeless, np.zeros(2), [0, 1], none, 1e-6, 40, secant=True, limit=1.0
-    )
-    assert accepted == 0 and hopeless.differentiated == 1 and not u.any()
-
-
-def test_sums_of_blocks_are_those_of_all_pixels():
-    """Of images that the number of blocks does not divide, with background that depends on nothing."""
-    generator = torch.Generator().manual_seed(3)
-    shape, k = (2, 3, 10, 13, 3), 4
-    *columns, r = (torch.randn(shape, generator=generator) for _ in range(k + 1))
-    for column in columns:
-        column[:, :, :4] = 0.0
-    curvatures, scores = block_sums(columns, r)
-    assert curvatures.shape == (3 * BLOCKS**2, k, k) and scores.shape == (3 * BLOCKS**2, k)
-    J = torch.stack([in_blocks(column) for column in columns], dim=-1).double()
-    np.testing.assert_allclose(curvatures, J.mT @ J, rtol=1e-10, atol=1e-12)
-    np.testing.assert_allclose(
-        scores, (J.mT @ in_blocks(r).double()[..., None])[..., 0], rtol=1e-10, atol=1e-12
-    )
-
-
-def test_least_squares_of_a_line_and_its_jackknife():
-    """Independent noise: the jackknife's variance is that of linear regression, sigma^2 (A^T A)^-1, and infinite cost
-    is a wall that is not passed."""
-    generator = np.random.default_rng(0)
-    a, errors, stds = generator.standard_normal((1600, 2)), [], []
-    none = lambda fit: np.zeros((2, 2))  # noqa: E731
-    for _ in range(20):
-        b = a @ [2.0, -1.0] + 0.3 * generator.standard_normal(1600)
-        u, fit, _ = levenberg_marquardt(Line(a, b), np.zeros(2), [0, 1], none, 1e-12, 20)
-        errors.append(u - [2.0, -1.0])
-        stds.append(np.sqrt(np.diag(jackknife(fit, none(fit)))))
-    expected = 0.3 * np.sqrt(np.diag(np.linalg.inv(a.T @ a)))
-    np.testing.assert_allclose(np.mean(stds, axis=0), expected, rtol=0.25)
-    assert np.abs(errors).max() < 4 * expected.max()
-    u, *_ = levenberg_marquardt(Line(a, b, wall=1.5), np.zeros(2), [0, 1], none, 1e-12, 40)
-    assert 1.0 < u[0] <= 1.5
