@@ -80,21 +80,22 @@ def share_inside(test: Mapping[str, Any], method: str, band_of: str) -> float | 
 
 
 @style.styled
-def draw(curves: Mapping[str, Any], titles: Mapping[str, str]) -> Figure:
-    """Draw a panel for each test, one below the other.
+def draw(curves: Mapping[str, Mapping[str, Any]], titles: Mapping[str, str]) -> Figure:
+    """Draw a column for each body, with a panel for each test.
 
     Args:
-        curves: result of `stress_curves`.
+        curves: result of `stress_curves` by body. The only body has an empty name.
         titles: method -> name.
     """
-    figure = style.new_figure(style.COLUMN, 0.4 + 1.5 * len(curves["tests"]))
-    panels = figure.subplots(len(curves["tests"]), 1, squeeze=False)[:, 0]
-    for axes, (name, test) in zip(panels, curves["tests"].items(), strict=True):
-        _panel(axes, test, titles, curves["learned"])
-        xlabel, ylabel = TESTS[name]
-        axes.set(xlabel=xlabel.format(rate=curves["rate"]), ylabel=f"{ylabel} [kPa]")
-    figure.align_ylabels(panels)
-    style.legend_above(figure, panels[0], 2)
+    figure = style.new_figure(style.COLUMN * len(curves), 0.4 + 1.5 * len(TESTS))
+    panels = figure.subplots(len(TESTS), len(curves), squeeze=False)
+    for column, (body, own) in zip(panels.T, curves.items(), strict=True):
+        column[0].set_title(body)
+        for axes, (name, (xlabel, ylabel)) in zip(column, TESTS.items(), strict=True):
+            _panel(axes, own["tests"][name], titles, own["learned"])
+            axes.set(xlabel=xlabel.format(rate=own["rate"]), ylabel=f"{ylabel} [kPa]")
+        figure.align_ylabels(column)
+    style.legend_above(figure, panels[0, 0], 2)
     return figure
 
 
@@ -102,6 +103,7 @@ def _panel(axes, test: Mapping[str, Any], titles: Mapping[str, str], learned: st
     draw_visited(axes, test["visited"], test["by_stress"], label="seen in the video")
     draw_laws(axes, test, titles, thick=learned)
     set_limits(axes, test["x"], *_limits(test, learned))
+    axes.xaxis.set_major_locator(MaxNLocator(4))  # small ranges have long labels
 
 
 def draw_visited(axes, visited: Sequence[float], by_stress: bool, **options) -> None:

@@ -348,7 +348,7 @@ class Method(ABC):
             law: from `load`.
             F: deformation gradients of the motion, shape (T, N, 3, 3); None: read from `inputs`.
             uncertainty: ``model_std`` and ``spread`` of the settings of `identify`.
-            drawn: ``dt`` [s], ``count`` and ``seed``.
+            drawn: ``dt`` [s], ``count`` and ``seed``, and ``body``, the name of a body that moves with others.
         """
         if self.draws_module is None:
             return []

@@ -15,12 +15,19 @@ from neuma_lib.mechanics.structured import StructuredLaw
 
 
 def draws(
-    inputs: Mapping[str, str], law: Law, F: Tensor | None, uncertainty: Mapping[str, Any], **drawn: Any
+    inputs: Mapping[str, str],
+    law: Law,
+    F: Tensor | None,
+    uncertainty: Mapping[str, Any],
+    body: str | None = None,
+    **drawn: Any,
 ) -> list[Law]:
     """As `Method.draws`, from ``identified`` and, for a correction without F, ``rollout``."""
     if not inputs:
         return []
     identified = read_json(inputs["identified"])
+    if body is not None:
+        identified = identified["bodies"][body]
     if not isinstance(law, StructuredLaw):
         return constants_draws(identified, uncertainty["model_std"], **drawn)
     if law.elasticity.form != "stretch":

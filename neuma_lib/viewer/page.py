@@ -17,12 +17,13 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from neuma_lib.coupling.bodies import BODY_COLOURS
 from neuma_lib.errors import InputError
 from neuma_lib.extras import require
 from neuma_lib.geometry.obstacles import Obstacle, obstacles
 from neuma_lib.io.files import write_text
 from neuma_lib.viewer.scalars import QUANTITIES
-from neuma_lib.viewer.scene import BODY_COLOURS, Log, Motion, Scene, View, frame_at
+from neuma_lib.viewer.scene import Log, Motion, Scene, View, frame_at
 
 COLOURS = {None: "viridis", 1.0: "coolwarm"}  # centre of a quantity's range -> colour map
 _WEBP = {"format": "WEBP", "quality": 80, "method": 4}

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from neuma_lib.coupling.bodies import coloured_solid, join
+from neuma_lib.coupling.bodies import BODY_COLOURS, coloured_solid, join
 from neuma_lib.coupling.deformation import arms_at_rest, deform
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError, NonFiniteError
@@ -25,7 +25,6 @@ from neuma_lib.sim.rollout import rollout
 from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.viewer import scalars
 from neuma_lib.viewer.live import LiveSimulation, Snapshot
-from neuma_lib.viewer.scene import BODY_COLOURS
 
 ADDED_SIZE = 0.22  # longest side of an added solid [m]
 ADDED_PARTICLES = 500

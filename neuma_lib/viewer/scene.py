@@ -27,10 +27,6 @@ from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.viewer import scalars
 
 TRUTH = "truth"
-BODY_COLOURS = (
-    (0.90, 0.62, 0.0), (0.34, 0.71, 0.91), (0.0, 0.62, 0.45), (0.80, 0.47, 0.65), (0.0, 0.45, 0.70),
-)  # fmt: skip
-"""RGB of the bodies in their order, those of Okabe and Ito (2008)."""
 _BOUND = 8  # number of true particles bound to a Gaussian of the reconstruction
 
 Log = Callable[[str], None]

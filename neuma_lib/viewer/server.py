@@ -13,6 +13,7 @@ import trimesh
 from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
+from neuma_lib.coupling.bodies import BODY_COLOURS
 from neuma_lib.errors import InputError
 from neuma_lib.extras import require
 from neuma_lib.geometry.obstacles import obstacles
@@ -22,7 +23,7 @@ from neuma_lib.viewer.live import EARTH, MAX_SPEED, PIVOT, Snapshot
 from neuma_lib.viewer.page import COLOURS
 from neuma_lib.viewer.playground import Picture, Playground
 from neuma_lib.viewer.scalars import QUANTITIES, rounded_up
-from neuma_lib.viewer.scene import BODY_COLOURS, Motion, Scene, frame_at
+from neuma_lib.viewer.scene import Motion, Scene, frame_at
 
 RECORDED, LIVE = "recorded", "live"
 NOTHING, SEEN, DISTANCE = "nothing", "Gaussians", "Gaussians by distance of both"

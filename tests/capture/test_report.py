@@ -237,9 +237,7 @@ def test_a_capture_without_faults_has_no_warnings():
     assert module.check_warnings({"Room": [Check("floor", "50 %", "> 20 %", True)]}) == []
     rows = [row("nclaw", psnr=15.0), row(), row(take="all", camera="all")]
     assert module.prediction_warnings(rows, "neuma", "nclaw", "constants", {"one": GOOD_MOTION}) == []
-    assert (
-        module.constants_warnings(None) == [] and module.curve_warnings(None, {}, "nclaw", "constants") == []
-    )
+    assert module.constants_warnings(None) == []
 
 
 @pytest.mark.parametrize(
@@ -325,3 +323,7 @@ def test_laws_outside_the_band_are_named():
     result = module.curve_warnings(curves, titles, "nclaw", "constants")
     assert len(result) == 3 and "no error bars" in result[1]
     assert result[2].startswith("Shear: over 100 % of the visited range, prior is outside")
+    inside = {**test, "laws": {**laws, "nclaw": laws["neuma"]}}
+    several = {"bodies": {"clay": curves, "gum": {**curves, "tests": {"shear": inside}}}}
+    of_bodies = module.curve_warnings(several, titles, "nclaw", "constants")
+    assert of_bodies[:2] == result[:2] and of_bodies[2:] == [f"clay: {result[2]}"]

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from neuma_lib.coupling.bodies import BODY_COLOURS
 from neuma_lib.io.files import write_json
 from neuma_lib.io.hdf5 import read_arrays, write_arrays
 from neuma_lib.project.find import find_laws, find_scene
 from neuma_lib.viewer.page import write_page
 from neuma_lib.viewer.playground import Playground, first_law
-from neuma_lib.viewer.scene import BODY_COLOURS, load_scene
+from neuma_lib.viewer.scene import load_scene
 from neuma_lib.viewer.server import LIVE, ViewerServer
 from tests.support.browser import opened
 from tests.support.viewer_project import SCENE, STEPS, make_project, make_splat

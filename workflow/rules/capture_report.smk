@@ -104,7 +104,10 @@ rule capture_curves:
         rollout=of_report(lambda name, method: f"{RESULTS}/{training_scene(name)}/{method}/rollout.h5"),
         laws=of_report(
             lambda name, method: [
-                file for law in report_laws(name, method).values() for file in law["files"].values()
+                file
+                for of_body in report_laws(name, method).values()
+                for law in of_body.values()
+                for file in {*law["files"].values(), *law["uncertainty"].values()}
             ]
         ),
     output:
@@ -151,8 +154,8 @@ REPORTED = {
     ),
     "images": f"{RESULTS}/{{capture}}/{{method}}/images.json",
     "table": f"{RESULTS}/{{capture}}/{{method}}/images.csv",
-    "curves": of_curves("stress_curves.json"),
-    "curves_picture": of_curves("stress_curves.png"),
+    "curves": f"{RESULTS}/{{capture}}/{{method}}/stress_curves.json",
+    "curves_picture": f"{RESULTS}/{{capture}}/{{method}}/stress_curves.png",
     "identified": of_report(report_identified),
 }
 

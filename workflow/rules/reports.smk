@@ -52,13 +52,6 @@ def object_reports(capture):
     return files
 
 
-def of_curves(file):
-    """A function of wildcards: a file of the stress curves of their report. None for several bodies."""
-    return of_report(
-        lambda name, method: [] if capture_named(name).labels else f"{RESULTS}/{name}/{method}/{file}"
-    )
-
-
 @checked
 def capture_start(wildcards):
     """File of the initial motion of a take: of the method, or of the free flight where the take is held out."""
@@ -101,12 +94,16 @@ def report_titles(method):
 
 
 def report_laws(name, method):
-    """Method, files and options of each law of a report, with the files of its uncertainty."""
-    laws = {}
+    """Method, files, options and files of the uncertainty of the laws of a report, by body and method."""
+    scene = training_scene(name)
+    laws = {body: {} for body in SETTINGS.scene(scene).bodies or [""]}
     for each in reported_methods(method):
-        case = case_on(training_scene(name), each)
-        files = {kind: paths[0] for kind, paths in law_files([case]).items()}
-        laws[each] = model_parameter([case]) | {"files": files | case.method.uncertainty_inputs(case)}
+        for of_body, case in zip(laws.values(), cases.body_cases(SETTINGS, scene, each), strict=True):
+            files = {kind: paths[0] for kind, paths in law_files([case]).items()}
+            of_body[each] = model_parameter([case]) | {
+                "files": files,
+                "uncertainty": case.method.uncertainty_inputs(case),
+            }
     return laws
 
 

@@ -27,7 +27,7 @@ def main(inputs, output, params, run) -> None:
 
     flights, registrations = named(motions, inputs.flights), named(motions, inputs.registrations)
     predictions, rows = named(takes, inputs.predictions), read_json(inputs.images)
-    curves = read_json(inputs.curves) if inputs.curves else None
+    curves = read_json(inputs.curves)
     identified = read_json(inputs.identified) if inputs.identified else None
     photographs = read_json(inputs.photographs)
     groups, pictures = {}, {}
@@ -98,7 +98,7 @@ def main(inputs, output, params, run) -> None:
         films=films,
         rows=rows,
         own=method,
-        curves=Path(inputs.curves_picture) if inputs.curves_picture else None,
+        curves=Path(inputs.curves_picture),
         identified=identified,
         scale=facts["scale"],
     )

@@ -25,7 +25,8 @@ def main(inputs, output, params, run) -> None:
         steps = filmed_steps(inputs.transforms, range(len(params.cameras)), **params.exposure)
         frames = sorted({0, *steps})
     path, failure = model.predict(mpm, start, frames, total=params.total)
-    write_arrays(output.rollout, {**path.arrays(), "frames": np.asarray(frames)}, {"dt": dt})
+    about = {"dt": dt, "particles": counts}  # of each body
+    write_arrays(output.rollout, {**path.arrays(), "frames": np.asarray(frames)}, about)
     message = f"{len(frames)} states to step {frames[-1]}, {frames[-1] * dt:.3f} s"
     if params.cameras:
         filmed = {camera: [] for camera in params.cameras}

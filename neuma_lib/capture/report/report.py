@@ -15,6 +15,7 @@ from PIL import Image
 
 from neuma_lib.capture.pictures import read_picture
 from neuma_lib.capture.report.page import Check
+from neuma_lib.coupling.bodies import BODY_COLOURS
 from neuma_lib.evaluation.calibration import GRID, describe_families, interval, kind_of
 
 _PICTURE_WIDTH, _QUALITY = 1000, 80  # maximum width [px] and JPEG quality of pictures in the page
@@ -194,8 +195,12 @@ def _laws(identified: Mapping[str, Any], scale: float) -> dict[str, dict[str, An
     if "bodies" not in identified:
         return {"": {**_law(identified, scale), "hidden": None}}
     return {
-        body: {**_law(own, scale), "hidden": f"{100 * max(identified['hidden'][body]):.0f} %"}
-        for body, own in identified["bodies"].items()
+        body: {
+            **_law(own, scale),
+            "hidden": f"{100 * max(identified['hidden'][body]):.0f} %",
+            "colour": ", ".join(f"{100 * part:.0f}%" for part in colour),
+        }
+        for (body, own), colour in zip(identified["bodies"].items(), BODY_COLOURS, strict=False)
     }
 
 

@@ -186,23 +186,22 @@ def constants_warnings(identified: Mapping[str, Any] | None) -> list[str]:
 
 
 def curve_warnings(
-    curves: Mapping[str, Any] | None, titles: Mapping[str, str], prior: str, constants: str
+    curves: Mapping[str, Any], titles: Mapping[str, str], prior: str, constants: str
 ) -> list[str]:
     """Warnings about stress curves: undetermined ranges, and contradictions between laws.
 
     Args:
-        curves: of `neuma_lib.evaluation.stress_curves.stress_curves`.
+        curves: of `neuma_lib.evaluation.stress_curves.stress_curves`, or under ``bodies`` by the name of the body.
         titles: of the methods.
         prior, constants: methods that evaluate the prior and the identified constants.
     """
-    if not curves:
-        return []
-    method, tests = curves["learned"], curves["tests"]
+    bodies = curves.get("bodies", {"": curves})
+    (method,) = {own["learned"] for own in bodies.values()}
     warnings = [
         "Outside the blue ranges, stress curves are extrapolated by the form of the law, since no part of the "
         "object was deformed that far."
     ]
-    if all(test["laws"][method]["band"] is None for test in tests.values()):
+    if all(test["laws"][method]["band"] is None for own in bodies.values() for test in own["tests"].values()):
         warnings.append(
             f"{titles[method]} has no error bars, since its networks have no estimate of uncertainty. The bands of "
             "the identified constants are the best substitute."
@@ -211,12 +210,16 @@ def curve_warnings(
         prior: "the video contradicts the prior there",
         method: "either the family is wrong, or the correction fits errors other than those of stress",
     }
-    for name, test in tests.items():
-        for law, verdict in verdicts.items():
-            share = share_inside(test, law, constants) if law in test["laws"] and law != constants else None
-            if share is not None and 1 - share > _MAX_OUTSIDE:
-                warnings.append(
-                    f"{_STRESS_TESTS[name].capitalize()}: over {100 * (1 - share):.0f} % of the visited range, "
-                    f"{titles[law]} is outside the 95 % band of the identified constants: {verdict}."
+    for body, own in bodies.items():
+        start = f"{body}: " if body else ""
+        for name, test in own["tests"].items():
+            for law, verdict in verdicts.items():
+                share = (
+                    share_inside(test, law, constants) if law in test["laws"] and law != constants else None
                 )
+                if share is not None and 1 - share > _MAX_OUTSIDE:
+                    warnings.append(
+                        f"{start}{_STRESS_TESTS[name].capitalize()}: over {100 * (1 - share):.0f} % of the visited "
+                        f"range, {titles[law]} is outside the 95 % band of the identified constants: {verdict}."
+                    )
     return warnings
