@@ -39,6 +39,8 @@ from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State, Trajectory
 from neuma_lib.splatting.observation import Observation, joint_frames, rendered_steps, select_frames, several
 
+_CHAOTIC = 1e4  # norm of a first gradient by which small differences grow in the motion of a law; those of Table 1 are below 100
+
 
 class TrajectoryLoss(Protocol):
     """Training loss: one number per frame from a simulated trajectory.
@@ -381,6 +383,11 @@ class _Loop(TrainingLoop):
             self.optimizer.zero_grad(set_to_none=True)
         (weighted / max(self.first_loss, 1e-30)).backward()
         norms = {name: self._clip_gradients(p, name) for name, p in self.nets.items() if p}
+        if iteration == 0 and (largest := max(norms.values())) > _CHAOTIC:
+            self.log(
+                f"WARNING: the first gradient has a norm of {largest:.1e}: the motion of this law amplifies small "
+                "differences, so that the training may fail. Try another prior, for example +prior_seed=1"
+            )
         return norms, float(weighted.detach())
 
     def _step(self) -> None:

@@ -158,6 +158,22 @@ def test_recovery_returns_to_the_best_state_as_a_whole(problem, zero_gradients):
     assert 0 < step(again) < step(after_best)
 
 
+@pytest.mark.parametrize("slope", [0.0, 1e9])
+def test_a_first_gradient_of_a_chaotic_motion_is_named(problem, slope):
+    """Once, and with its norm."""
+    body, loss = problem
+
+    class Steep(ScriptedLoss):
+        def __call__(self, path):
+            return self.loss(path) + slope * (path.x - path.x.detach()).mean()
+
+    messages, settings = [], SETTINGS.model_copy(update={"iterations": 2})
+    train_material(MODEL, stiff_random_law(), body.state(V0), Steep(loss, []), settings, log=messages.append)
+    named = [text for text in messages if text.startswith("WARNING: the first gradient has a norm of ")]
+    assert len(named) == (1 if slope else 0)
+    assert all(float(text.split("norm of ")[1].split(":")[0]) > 1e4 for text in named)
+
+
 def test_a_run_that_is_killed_after_a_recovery_resumes_with_its_lower_rates(problem):
     """The step after the resume is of the uninterrupted run, bit by bit."""
     body, loss = problem
