@@ -81,20 +81,21 @@ def share_inside(test: Mapping[str, Any], method: str, band_of: str) -> float | 
 
 @style.styled
 def draw(curves: Mapping[str, Mapping[str, Any]], titles: Mapping[str, str]) -> Figure:
-    """Draw a column for each body, with a panel for each test.
+    """Draw a panel for each test: below each other for one body, else in a row for each body.
 
     Args:
         curves: result of `stress_curves` by body. The only body has an empty name.
         titles: method -> name.
     """
-    figure = style.new_figure(style.COLUMN * len(curves), 0.4 + 1.5 * len(TESTS))
-    panels = figure.subplots(len(TESTS), len(curves), squeeze=False)
-    for column, (body, own) in zip(panels.T, curves.items(), strict=True):
-        column[0].set_title(body)
-        for axes, (name, (xlabel, ylabel)) in zip(column, TESTS.items(), strict=True):
+    rows, columns = (len(curves), len(TESTS)) if len(curves) > 1 else (len(TESTS), 1)
+    figure = style.new_figure(style.COLUMN * columns, 0.4 + 1.5 * rows)
+    panels = figure.subplots(rows, columns, squeeze=False)
+    for row, (body, own) in zip(panels.reshape(len(curves), -1), curves.items(), strict=True):
+        row[0].set_title(body)
+        for axes, (name, (xlabel, ylabel)) in zip(row, TESTS.items(), strict=True):
             _panel(axes, own["tests"][name], titles, own["learned"])
             axes.set(xlabel=xlabel.format(rate=own["rate"]), ylabel=f"{ylabel} [kPa]")
-        figure.align_ylabels(column)
+    figure.align_ylabels(panels)
     style.legend_above(figure, panels[0, 0], 2)
     return figure
 

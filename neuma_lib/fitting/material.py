@@ -14,6 +14,7 @@ NeuMA w/o dM                    full-rank adaptor (the base weights themselves),
 from __future__ import annotations
 
 import copy
+import logging
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -39,7 +40,13 @@ from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State, Trajectory
 from neuma_lib.splatting.observation import Observation, joint_frames, rendered_steps, select_frames, several
 
-_CHAOTIC = 1e4  # norm of a first gradient by which small differences grow in the motion of a law; those of Table 1 are below 100
+_CHAOTIC = 1e4
+"""Norm of the first gradient of the loss relative to its first value, above which small differences grow.
+
+In Table 1, norms are at most 60, except with one prior on HoneyBottle, where they are at least 1e8.
+"""
+
+_LOGGER = logging.getLogger(__name__)
 
 
 class TrajectoryLoss(Protocol):
@@ -384,9 +391,9 @@ class _Loop(TrainingLoop):
         (weighted / max(self.first_loss, 1e-30)).backward()
         norms = {name: self._clip_gradients(p, name) for name, p in self.nets.items() if p}
         if iteration == 0 and (largest := max(norms.values())) > _CHAOTIC:
-            self.log(
-                f"WARNING: the first gradient has a norm of {largest:.1e}: the motion of this law amplifies small "
-                "differences, so that the training may fail. Try another prior, for example +prior_seed=1"
+            _LOGGER.warning(
+                f"the first gradient has a norm of {largest:.1e}: the motion of law {self.law.name!r} amplifies small "
+                "differences, so that the training may fail. If it is a trained prior, try one of another seed"
             )
         return norms, float(weighted.detach())
 

@@ -24,8 +24,8 @@ def main(inputs, output, params, run) -> None:
         for name, source in sources.items():
             method, options = method_of(source["module"]), source["options"][0]
             laws[name] = method.load(source["files"], options, params.dt).law
-            own = {"body": options.get("body"), **drawn}
-            if drawn_laws := method.draws(source["uncertainty"], laws[name], F, uncertainty, **own):
+            own = {key: options[key] for key in ("body",) if key in options}
+            if drawn_laws := method.draws(source["uncertainty"], laws[name], F, uncertainty, **drawn, **own):
                 draws[name] = drawn_laws
         curves[body] = stress_curves(
             laws, params.method, F, params.rate, params.total_shear, params.dt, draws, params.scale

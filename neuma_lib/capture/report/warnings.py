@@ -203,8 +203,8 @@ def curve_warnings(
     ]
     if all(test["laws"][method]["band"] is None for own in bodies.values() for test in own["tests"].values()):
         warnings.append(
-            f"{titles[method]} has no error bars, since its networks have no estimate of uncertainty. The bands of "
-            "the identified constants are the best substitute."
+            f"{titles[method]} has no error bars, since its uncertainty is not estimated. The bands of the identified "
+            "constants are the best substitute."
         )
     verdicts = {
         prior: "the video contradicts the prior there",
