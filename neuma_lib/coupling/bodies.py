@@ -19,6 +19,7 @@ BODY_COLOURS = (
     (0.90, 0.62, 0.0), (0.34, 0.71, 0.91), (0.0, 0.62, 0.45), (0.80, 0.47, 0.65), (0.0, 0.45, 0.70),
 )  # fmt: skip
 """RGB of the bodies in their order, those of Okabe and Ito (2008)."""
+
 _WIDTH = 0.55  # standard deviation of a Gaussian in particle spacings, for closed surfaces with sharp edges
 _OPACITY = 0.95
 _LIGHT = (0.35, 0.8, 0.5)  # direction to the light: from above, slightly to the right of the camera

@@ -327,3 +327,22 @@ def test_laws_outside_the_band_are_named():
     several = {"bodies": {"clay": curves, "gum": {**curves, "tests": {"shear": inside}}}}
     of_bodies = module.curve_warnings(several, titles, "nclaw", "constants")
     assert of_bodies[:2] == result[:2] and of_bodies[2:] == [f"clay: {result[2]}"]
+
+
+@pytest.mark.parametrize("bodies", [("",), ("clay", "gum")])
+def test_curves_of_several_bodies_have_a_row_each(bodies):
+    pytest.importorskip("matplotlib")
+    from neuma_lib.evaluation.stress_curves import TESTS, draw
+
+    def own(slope):
+        laws = {"constants": curve([slope * v for v in range(4)], band=0.5)}
+        test = {"x": [0.0, 1.0, 2.0, 3.0], "visited": [0.0, 3.0], "by_stress": False, "laws": laws}
+        return {"learned": "constants", "rate": 20, "tests": dict.fromkeys(TESTS, test)}
+
+    figure = draw({body: own(1000.0 * k) for k, body in enumerate(bodies, 1)}, {"constants": "constants"})
+    rows = [figure.axes[k : k + len(TESTS)] for k in range(0, len(figure.axes), len(TESTS))]
+    assert [row[0].get_title() for row in rows] == [*bodies]
+    for k, row in enumerate(rows, 1):
+        assert all(axes.lines[0].get_ydata()[-1] == pytest.approx(3.0 * k) for axes in row)  # kPa
+    places = {(round(axes.get_position().x0, 2)) for axes in figure.axes}
+    assert len(places) == (len(TESTS) if len(bodies) > 1 else 1)
