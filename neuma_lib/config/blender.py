@@ -40,7 +40,7 @@ class BlenderConfig(Section):
 
     device: Literal["cpu", "auto", "cuda"] = Field(
         "cpu",
-        description="CPU (reproducible to the byte), a CUDA GPU, or `auto`: CUDA if the top-level `device` is not cpu "
-        "and there is a GPU",
+        description="CPU (reproducible to the byte), a CUDA GPU, or `auto`: CUDA if the top-level `device` is not cpu, "
+        "there is a GPU, and Blender has machine code for it",
     )
     threads: int = Field(1, ge=1, description="CPU cores of each process")

@@ -2,6 +2,8 @@
 
 import json
 import os
+import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
@@ -289,6 +291,40 @@ def test_without_a_gpu_auto_is_the_cpu_and_cuda_an_error(tmp_path):
     with refused("dataset.blender.device"):
         render_static(body, views, tmp_path / "cuda", 4, device="cuda")
     assert list((tmp_path / "cuda").iterdir()) == []
+
+
+DEVICE_OF = """
+import sys, types, bpy
+from cycles.properties import CyclesPreferences
+from neuma_lib.data.blender import cycles
+CyclesPreferences.get_devices_for_type = lambda self, kind: [types.SimpleNamespace(type=kind, use=False)]
+CyclesPreferences.compute_device_type = ""
+cycles._compute_capability = lambda: {"unknown": None}.get(sys.argv[1], sys.argv[1])
+cycles.start(8, 8, 1, 1, sys.argv[2])
+print(bpy.context.scene.cycles.device)
+"""
+
+
+@needs_blender
+@pytest.mark.parametrize(
+    ("capability", "device", "used"),
+    [
+        ("86", "cuda", "GPU"),
+        ("unknown", "cuda", "GPU"),
+        ("86", "auto", "GPU"),
+        ("90", "auto", "CPU"),
+        ("90", "cuda", None),
+    ],
+)
+def test_a_gpu_needs_machine_code(capability, device, used):
+    """The driver of an H200 (compute capability 9.0) compiles Cycles for more than 400 s without any output."""
+    run = subprocess.run(
+        [sys.executable, "-c", DEVICE_OF, capability, device], capture_output=True, text=True
+    )
+    assert run.stdout.split()[-1:] == ([used] if used else []), run.stderr
+    assert (
+        "InputError: dataset.blender.device: is cuda, but Blender has no kernel_sm_90.cubin" in run.stderr
+    ) == (used is None)
 
 
 @needs_blender

@@ -1,5 +1,6 @@
 """The Blender scene. Imports bpy and is used through `neuma_lib.data.blender.scene`."""
 
+import ctypes
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -19,10 +20,11 @@ def start(width: int, height: int, samples: int, threads: int, device: str = "cp
     """An empty scene with the renderer's settings and the light.
 
     Args:
-        device: of rendering and denoising: "cpu"; "cuda", the first visible CUDA device; or "auto", CUDA if available.
+        device: of rendering and denoising: "cpu"; "cuda", the first visible CUDA device; or "auto", CUDA if Blender has
+            a device and machine code for it.
 
     Raises:
-        InputError: CUDA is requested and Blender has no device.
+        InputError: CUDA is requested, and Blender has no device or no machine code for it.
     """
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
@@ -60,27 +62,57 @@ def start(width: int, height: int, samples: int, threads: int, device: str = "cp
     lamp.rotation_mode = "QUATERNION"
     lamp.rotation_quaternion = towards.to_track_quat("Z", "Y")
     scene.collection.objects.link(lamp)
-    if device != "cpu" and not _use_cuda() and device == "cuda":
-        remedy = "Use cpu or auto, or check the driver"
-        raise InputError("dataset.blender.device", "is cuda, but Blender has no CUDA device", remedy)
+    if device != "cpu":
+        _use_cuda(required=device == "cuda")
 
 
-def _use_cuda() -> bool:
-    """Render and denoise on the first CUDA device; returns False without changes if there is none.
+def _use_cuda(required: bool) -> None:
+    """Render and denoise on the first CUDA device, if Blender can use one.
 
     Small images are rendered faster by one process per device than by several devices together.
     """
     preferences = bpy.context.preferences.addons["cycles"].preferences
     devices = [each for each in preferences.get_devices_for_type("CUDA") if each.type == "CUDA"]
-    if not devices:
-        return False
-    preferences.compute_device_type = "CUDA"
-    for number, each in enumerate(devices):
-        each.use = number == 0
-    cycles = bpy.context.scene.cycles
-    cycles.device = "GPU"
-    cycles.denoising_use_gpu = True
-    return True
+    missing = _missing_code(_compute_capability()) if devices else None
+    if devices and not missing:
+        preferences.compute_device_type = "CUDA"
+        for number, each in enumerate(devices):
+            each.use = number == 0
+        cycles = bpy.context.scene.cycles
+        cycles.device = "GPU"
+        cycles.denoising_use_gpu = True
+    elif required and missing:
+        # The driver would compile for longer than most renders take, without any output.
+        problem = f"is cuda, but Blender has no {missing}, the machine code for this GPU"
+        remedy = "Use cpu or auto, or compile it as described in docs/scale.md"
+        raise InputError("dataset.blender.device", problem, remedy)
+    elif required:
+        remedy = "Use cpu or auto, or check the driver"
+        raise InputError("dataset.blender.device", "is cuda, but Blender has no CUDA device", remedy)
+
+
+def _compute_capability() -> str | None:
+    """Compute capability of the first visible CUDA device, such as "90", from the driver. None if that is unknown."""
+    try:
+        driver = ctypes.CDLL("libcuda.so.1")
+    except OSError:
+        return None
+    driver.cuInit(0)
+    numbers = []
+    for attribute in (75, 76):  # CU_DEVICE_ATTRIBUTE_COMPUTE_CAPABILITY_MAJOR and _MINOR
+        number = ctypes.c_int()
+        if driver.cuDeviceGetAttribute(ctypes.byref(number), attribute, 0) != 0:
+            return None
+        numbers.append(number.value)
+    return "".join(map(str, numbers))
+
+
+def _missing_code(capability: str | None) -> str | None:
+    """Name of the file with machine code for a compute capability, if Cycles has files but not this one."""
+    folder = Path(bpy.utils.system_resource("SCRIPTS", path="addons_core/cycles/lib"))
+    name = f"kernel_sm_{capability}.cubin"
+    present = {file.name.removesuffix(".zst") for file in folder.glob("kernel_sm_*.cubin*")}
+    return name if capability is not None and present and name not in present else None
 
 
 def add_camera(focal: float, width: int) -> bpy.types.Object:

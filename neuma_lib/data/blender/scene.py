@@ -140,14 +140,14 @@ def render_images(
         samples: samples per pixel, denoised (except alpha: 8 are usable, 16 clean).
         threads: CPU cores for Blender.
         progress: called with the numbers of finished and of all images.
-        device: "cpu", "cuda", or "auto", CUDA if Blender has a device.
+        device: "cpu", "cuda", or "auto", CUDA if Blender has a device and machine code for it.
         obstacles: other objects, with a pose for each frame.
         matte: alpha is the mask of the visible part of the object. Obstacles and white surroundings are in the colours,
             where alpha is 0. Otherwise alpha is the mask of everything.
 
     Raises:
-        InputError: Blender cannot be imported (the message names the package to install), or it has no CUDA device but
-            one is requested.
+        InputError: Blender cannot be imported (the message names the package to install), or CUDA is requested and
+            Blender has no CUDA device or no machine code for it.
         RuntimeError: Blender failed; the message ends with its last output.
     """
     out_dir = Path(out_dir)
