@@ -294,12 +294,26 @@ def test_without_a_gpu_auto_is_the_cpu_and_cuda_an_error(tmp_path):
 
 
 DEVICE_OF = """
-import sys, types, bpy
+import ctypes, sys, types, bpy
 from cycles.properties import CyclesPreferences
 from neuma_lib.data.blender import cycles
 CyclesPreferences.get_devices_for_type = lambda self, kind: [types.SimpleNamespace(type=kind, use=False)]
 CyclesPreferences.compute_device_type = ""
-cycles._compute_capability = lambda: {"unknown": None}.get(sys.argv[1], sys.argv[1])
+
+
+def driver(name):
+    if sys.argv[1] == "unknown":
+        raise OSError(name)
+    numbers = dict(zip((75, 76), map(int, sys.argv[1])))
+
+    def attribute(out, which, device):
+        out._obj.value = numbers[which]
+        return 0
+
+    return types.SimpleNamespace(cuInit=lambda flags: 0, cuDeviceGetAttribute=attribute)
+
+
+cycles.ctypes = types.SimpleNamespace(CDLL=driver, c_int=ctypes.c_int, byref=ctypes.byref)
 cycles.start(8, 8, 1, 1, sys.argv[2])
 print(bpy.context.scene.cycles.device)
 """

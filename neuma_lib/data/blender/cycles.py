@@ -81,14 +81,12 @@ def _use_cuda(required: bool) -> None:
         cycles = bpy.context.scene.cycles
         cycles.device = "GPU"
         cycles.denoising_use_gpu = True
-    elif required and missing:
-        # The driver would compile for longer than most renders take, without any output.
-        problem = f"is cuda, but Blender has no {missing}, the machine code for this GPU"
-        remedy = "Use cpu or auto, or compile it as described in docs/scale.md"
-        raise InputError("dataset.blender.device", problem, remedy)
     elif required:
-        remedy = "Use cpu or auto, or check the driver"
-        raise InputError("dataset.blender.device", "is cuda, but Blender has no CUDA device", remedy)
+        # Without machine code, the driver compiles for more than 400 s without any output.
+        problem = f"{missing}, the machine code for this GPU" if missing else "CUDA device"
+        remedy = "compile it as described in docs/scale.md" if missing else "check the driver"
+        what = f"is cuda, but Blender has no {problem}"
+        raise InputError("dataset.blender.device", what, f"Use cpu or auto, or {remedy}")
 
 
 def _compute_capability() -> str | None:
