@@ -70,6 +70,12 @@ SUMMARY = (
         ("paper_scale/table1",),
         "Average",
     ),
+    (
+        "the same, converged truths",
+        "paper_scale/README.md",
+        ("paper_scale/table1_converged",),
+        "Average",
+    ),
 )
 """Rows of the summary: text, page, tables (the first of the same record that has a method is used), and column."""
 END = "<!-- / -->"
