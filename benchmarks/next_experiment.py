@@ -55,7 +55,7 @@ from neuma_lib.splatting.observation import Observation
 from neuma_lib.splatting.viewpoints import video_views
 
 STD = np.array([0.01, 0.01, 0.03, 0.05, 0.05, 0.05])  # of the estimate of the initial motion [m/s, rad/s]
-CHUNKS = 4  # tasks of a pool
+CHUNKS = 2  # tasks of a pool
 EXPERIMENTS = 6  # of a loop, with the first one
 Video = tuple[InitialMotion, Reconstruction, Observation]
 
