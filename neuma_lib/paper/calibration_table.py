@@ -21,6 +21,7 @@ from neuma_lib.evaluation.coverage import Intervals, brier_score, mean_over_scen
 from neuma_lib.evaluation.text_tables import as_csv, as_markdown
 from neuma_lib.fitting.families import FRICTION
 from neuma_lib.paper.claims import FAILS, HOLDS, MIXED, Verdict, verdict_lines
+from neuma_lib.paper.identified_table import WITHIN
 
 TARGETS = {0.5: (0.45, 0.55), 0.8: (0.75, 0.85), 0.95: (0.92, 0.98)}
 """Level of intervals -> range of the share of truths that they should contain."""
@@ -178,7 +179,9 @@ def table_rows(scenes: Sequence[Mapping[str, Any]]) -> Iterator[dict[str, Any]]:
                 yield {"quantity": FAMILY, "group": group, "method": method, "level": "", **measured}
 
 
-def calibration_table(scenes: Sequence[Mapping[str, Any]], is_development: bool) -> tuple[str, str]:
+def calibration_table(
+    scenes: Sequence[Mapping[str, Any]], is_development: bool, determined: float
+) -> tuple[str, str]:
     """CSV with a row for each quantity, kind of truth, method and level, and Markdown with verdicts.
 
     Args:
@@ -187,6 +190,7 @@ def calibration_table(scenes: Sequence[Mapping[str, Any]], is_development: bool)
             ``motions`` with ``value_mm``, ``truth_mm``, ``std_mm``, ``laplace_std_mm`` (T, M, 3) and ``start_mm``
             (M, 3) by name.
         is_development: whether quantiles are measured on these scenes. There are no verdicts then.
+        determined: maximum standard deviation of the logarithm of a determined constant.
 
     Raises:
         InputError: there are no scenes.
@@ -207,6 +211,7 @@ def calibration_table(scenes: Sequence[Mapping[str, Any]], is_development: bool)
                 "",
             ]
     text += _families(scenes, rows)
+    text += _determined(scenes, determined)
     text += _left_out(scenes)
     text += [] if is_development else verdict_lines(_verdicts(rows))
     text += [RULE, ""]
@@ -272,6 +277,30 @@ def _families(scenes: Sequence[Mapping[str, Any]], rows: Sequence[Mapping[str, A
         ),
         "",
     ]
+
+
+def _determined(scenes: Sequence[Mapping[str, Any]], below: float) -> list[str]:
+    """Table of the constants with an estimated standard deviation below a limit."""
+    lines = []
+    for group, own in groups_of(scenes).items():
+        known = [scene["families"] for scene in own if scene["families"]]
+        right = f"{sum(each['selected'] in each['right'] for each in known)} of {len(known)}" if known else ""
+        rows = [row for scene in own for row in scene["constants"] if row["name"] != FRICTION]
+        logs = [(math.log(row["value"] / row["truth"]), row["log_std"]) for row in rows]
+        errors = [(math.expm1(error), error / std) for error, std in logs if std < below]
+        close = sum(abs(error) <= BAND for error, _ in errors)
+        near = sum(abs(z) <= WITHIN for _, z in errors)
+        lines.append([group, len(own), right, f"{len(errors)} of {len(rows)}", close, near])
+    head = [
+        "group",
+        "scenes",
+        "family right",
+        "determined",
+        f"within {100 * BAND:.0f} %",
+        f"within {WITHIN:.0f} std",
+    ]
+    title = f"**Determined constants**, with an estimated standard deviation below {100 * below:.0f} %"
+    return [title, "", *as_markdown(head, lines), ""]
 
 
 def _left_out(scenes: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -91,7 +91,7 @@ def verdicts(text: str) -> list[str]:
 
 def test_intervals_that_were_calibrated_hold_on_other_scenes(use):
     use(calibrated(synthetic(200, 0), {}))
-    table, text = calibration_table(synthetic(200, 1), is_development=False)
+    table, text = calibration_table(synthetic(200, 1), is_development=False, determined=0.1)
     lines = verdicts(text)
     assert len(lines) == 12 and all("**holds**" in line for line in lines), "\n".join(lines)
     rows = {
@@ -113,7 +113,7 @@ def test_intervals_that_were_calibrated_hold_on_other_scenes(use):
 @pytest.mark.parametrize("factor", [0.6, 1.7])
 def test_wrong_quantiles_do_not_hold(use, factor):
     use(calibrated(synthetic(200, 0), {}), factor)
-    lines = verdicts(calibration_table(synthetic(200, 1), is_development=False)[1])
+    lines = verdicts(calibration_table(synthetic(200, 1), is_development=False, determined=0.1)[1])
     wrong = [line for line in lines if "**does not hold**" in line]
     assert len(wrong) >= 9 and not any("**holds**" in line for line in lines if "50 %" in line), "\n".join(
         lines
@@ -126,7 +126,7 @@ def test_normal_intervals_do_not_hold_for_these_errors(monkeypatch):
     scenes = synthetic(200, 1)
     assert coverage(scenes, "constants", CALIBRATED, 0.5)["covered_low"] > 0.7
     assert coverage(scenes, "another shape", CALIBRATED, 0.95)["covered_high"] < 0.6
-    assert "Nothing has been calibrated" in calibration_table(scenes, False)[1]
+    assert "Nothing has been calibrated" in calibration_table(scenes, False, 0.1)[1]
 
 
 def test_scenes_on_the_same_grid_have_other_quantiles(use):
@@ -198,7 +198,7 @@ def test_cross_validation_uses_other_scenes():
 
 def test_groups_are_of_family_and_truth(use):
     use(calibrated(synthetic(20, 0), {}))
-    table, text = calibration_table([*synthetic(20, 1), *synthetic(20, 2, converged=False)], True)
+    table, text = calibration_table([*synthetic(20, 1), *synthetic(20, 2, converged=False)], True, 0.1)
     groups = {row["group"] for row in csv.DictReader(io.StringIO(table))}
     assert groups == {
         "all",
@@ -216,12 +216,42 @@ def test_scenes_without_a_result_are_listed(use):
     scenes[0] |= {"motions": {}, "failed": {"launch": "it broke", "shape": "it broke"}, "constants": []}
     scenes[1] |= {"at_least": [0.3, 0.5]}
     scenes[2] |= {"at_least": [0.3, 0.2]}
-    text = calibration_table(scenes, True)[1]
+    text = calibration_table(scenes, True, 0.1)[1]
     assert "Without constants to compare: random2_000" in text
     assert "Without a prediction of another shape: random2_000 (it broke)" in text
     assert "2 scenes, 1 below the truth" in text
     with refused("random.count"):
-        calibration_table([], True)
+        calibration_table([], True, 0.1)
+
+
+def test_determined_constants_are_counted():
+    """Only those below the limit, without the friction."""
+    scenes = synthetic(2, 0, converged=False)
+    cases = [
+        ("E", 1.05, 0.02),
+        ("G", 1.2, 0.05),
+        ("K", 1.08, 0.09),
+        ("viscosity", 1.01, 0.2),
+        (FRICTION, 1, 0.01),
+    ]
+    for scene in scenes:
+        scene["constants"] = [
+            {"name": name, "truth": 2.0, "value": 2 * ratio, "log_std": std, "laplace_log_std": std}
+            for name, ratio, std in cases
+        ]
+    scenes[0]["families"] = None
+    scenes[1]["families"] |= {"selected": "0", "right": ["1"]}
+    lines = calibration_table(scenes, True, 0.1)[1].splitlines()
+    counts = [
+        line
+        for line in lines
+        if line.startswith(("| all | 2 | 0 of 1 |", "| outside the candidates, same grid | 1 |  |"))
+    ]
+    # of E, G and K of each scene: E and K are within 10 %, K alone within two standard deviations
+    assert [line.split("|")[4:7] for line in counts] == [
+        [" 6 of 8 ", " 4 ", " 2 "],
+        [" 3 of 4 ", " 2 ", " 1 "],
+    ]
 
 
 # ---- records

@@ -36,6 +36,7 @@ rule calibration_table:
         markdown=f"{RESULTS}/calibration.md",
     params:
         development=SETTINGS.random.is_development,
+        determined=SETTINGS.identify.determined,
     script:
         "../scripts/calibration_table.py"
 

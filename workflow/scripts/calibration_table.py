@@ -6,7 +6,8 @@ from workflow.stage import run_script
 
 
 def main(inputs, output, params, run) -> None:
-    csv, markdown = calibration_table(list(map(read_json, inputs.records)), params.development)
+    scenes = list(map(read_json, inputs.records))
+    csv, markdown = calibration_table(scenes, params.development, params.determined)
     write_text(output.csv, csv)
     write_text(output.markdown, markdown)
     run.log(f"{len(inputs.records)} scenes")
