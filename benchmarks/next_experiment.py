@@ -8,16 +8,16 @@ outside the families. Videos are renders of the true body, filled with particles
 reconstruction has other and fewer particles and Gaussians, so that residuals are correlated errors of a reconstruction.
 There is no Blender and no fit of Gaussians. The choice does not read the truth.
 
-Each material has tasks that run in parallel. In "pool" tasks, every candidate of the first choice is done, and the true
-family is fitted (of materials outside, the identified one): the chosen one, the best in hindsight and the mean of the
-random launches are all from this pool. In "loop" tasks, all families are fitted to chosen or random experiments one
-after the other, until all constants are determined. Results are written after each task, and finished tasks are
-skipped.
+Tasks of a material run in parallel. A "ranking" is the first choice by the true family (of materials outside, by the
+identified one). Each of its candidates is then done in a "fit", which fits this family to both videos: the chosen one,
+the best in hindsight and the mean of the random launches are from these. In a "loop", all families are fitted to chosen
+or random experiments one after the other, until all constants are determined. Results are written after each task, and
+finished tasks are skipped.
 """
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
@@ -36,7 +36,7 @@ from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.data.blender.appearance import colors_at
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.evaluation.text_tables import as_markdown
-from neuma_lib.fitting.candidate_experiments import as_cameras, placed
+from neuma_lib.fitting.candidate_experiments import as_cameras, draw_starts, placed
 from neuma_lib.fitting.choose_next import Option, Selection, choose_next, read_rivals
 from neuma_lib.fitting.identified import FamilyFit, Identified
 from neuma_lib.fitting.identify import identify
@@ -48,6 +48,8 @@ from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.combinations import constants_of, physical
 from neuma_lib.project.loading import load, merged, read_yaml
 from neuma_lib.project.settings import Config
+from neuma_lib.sim.clamps import Clamp
+from neuma_lib.sim.colliders import Collider
 from neuma_lib.sim.model import MPM
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.splatting.cameras import Cameras
@@ -55,14 +57,14 @@ from neuma_lib.splatting.observation import Observation
 from neuma_lib.splatting.viewpoints import video_views
 
 STD = np.array([0.01, 0.01, 0.03, 0.05, 0.05, 0.05])  # of the estimate of the initial motion [m/s, rad/s]
-CHUNKS = 2  # tasks of a pool
-EXPERIMENTS = 6  # of a loop, with the first one
+EXPERIMENTS = 4  # of a loop, with the first one
 Video = tuple[InitialMotion, Reconstruction, Observation]
+Settings = Mapping[str, Any]  # of an experiment, see `Option`
 
 
 @dataclass(frozen=True)
 class Task:
-    """Work on a material: kind "pool" with the number of its chunk, or "loop" with 1 for chosen experiments, else 0."""
+    """Work on a material: "ranking", "fit" with the rank of a candidate, or "loop" with 1 if it chooses, else 0."""
 
     scene: str
     kind: str
@@ -126,21 +128,36 @@ class Lab:
         exact = InitialMotion(np.array(velocity), np.array(spin), centre, axes, std)
         return exact.moved(self.random.standard_normal(6)), body, Observation(frames, images, cameras)
 
-    def repeat(self, option: Option) -> Video:
-        """Do an experiment that was chosen."""
-        own = option.settings
+    def model_of(self, own: Settings) -> MPM:
+        """The simulator with the platen or the clamp of an experiment."""
+        colliders = [Collider(**each) for each in own.get("colliders", ())]
+        clamps = [Clamp(**each) for each in own.get("clamps", ())]
+        return replace(
+            self.model, colliders=(*self.model.colliders, *colliders), clamps=(*self.model.clamps, *clamps)
+        )
+
+    def repeat(self, own: Settings) -> Video:
+        """Do an experiment that was chosen or drawn."""
         R = Rotation.from_rotvec(own.get("rotation", (0.0, 0.0, 0.0))).as_matrix()
         centre = (own["center"][0], own["height"], own["center"][1])
         at = [placed(each, R, centre) for each in (self.truth, self.body)]
-        return self.film(option.experiment.model, *at, own["velocity"], own["spin"], own["steps"])
+        return self.film(self.model_of(own), *at, own["velocity"], own["spin"], own["steps"])
+
+    def random_launch(self) -> Settings:
+        seed, lab = int(self.random.integers(2**31)), self.settings.next
+        (start,) = draw_starts(self.model, self.body, self.first[0], self.scene.steps, lab, 1, seed)
+        return start.settings
 
     def fitted(
-        self, options: Sequence[Option], families: Sequence[str], before: Identified | None = None
+        self,
+        experiments: Sequence[Settings],
+        families: Sequence[str],
+        start: Mapping[str, Any] | None = None,
     ) -> Identified:
-        """What is identified in the first launch and some other experiments, also from what was known ``before``."""
-        models = [self.model, *(option.experiment.model for option in options)]
-        videos = [self.repeat(option) for option in options]
-        start = before and before.best.family.law_spec(before.best.values)
+        """What is identified in the first launch and some other experiments, also from the law that was identified
+        before."""
+        models = [self.model, *map(self.model_of, experiments)]
+        videos = [self.repeat(own) for own in experiments]
         return identify(models, *self.first, self.chosen(families), start, other_videos=videos)
 
     def chosen(self, families: Sequence[str]) -> IdentifyConfig:
@@ -170,59 +187,89 @@ class Lab:
         return {"family": fit.family.name, "std": stds(fit, self.settings.identify), "error": errors}
 
 
-def run(settings: Config, task: Task) -> dict[str, Any]:
-    """The result of a task in plain values."""
+def law_of(result: Identified) -> dict[str, Any]:
+    return dict(result.best.family.law_spec(result.best.values))
+
+
+def run(settings: Config, task: Task, known: Mapping[str, Any] | None, experiments: int) -> dict[str, Any]:
+    """The result of a task in plain values.
+
+    Args:
+        known: result of the ranking of the material, for a fit.
+        experiments: at most of a loop, with the first one.
+    """
     torch.set_num_threads(1)
     lab = Lab(settings, task.scene)
     every = list(settings.identify.families)
     try:
-        return pool(lab, task.number, every) if task.kind == "pool" else loop(lab, bool(task.number), every)
+        if task.kind == "fit":
+            return fit(lab, task.number, known)
+        if task.kind == "loop":
+            return loop(lab, bool(task.number), every, experiments)
+        return ranking(lab, every)
     except (InputError, NonFiniteError) as error:
         return {"refused": str(error)}
 
 
-def pool(lab: Lab, chunk: int, every: Sequence[str]) -> dict[str, Any]:
-    """All candidates of the first choice, and the joint fits of a part of them."""
-    family = [lab.family] if lab.family in every else [lab.fitted([], every).best.family.name]
-    alone = lab.fitted([], family)
+def ranking(lab: Lab, every: Sequence[str]) -> dict[str, Any]:
+    """The first choice."""
+    family = lab.family if lab.family in every else lab.fitted([], every).best.family.name
+    alone = lab.fitted([], [family])
     started = core_seconds()
     selection = lab.selection(alone, [], lab.settings.random.seed)
+    options = [
+        {
+            "kind": option.kind,
+            "settings": option.settings,
+            "predicted": stds(option.forecast.fit, alone.settings),
+        }
+        for option in selection.options
+    ]
     seconds = core_seconds() - started
-    done = []
-    for rank, option in list(enumerate(selection.options))[chunk::CHUNKS]:
-        own = {"rank": rank, "kind": option.kind, "predicted": stds(option.forecast.fit, alone.settings)}
-        try:
-            done.append({**own, **lab.summary(lab.fitted([option], family, alone).best)})
-        except NonFiniteError as error:
-            done.append({**own, "refused": str(error)})
-    return {"alone": lab.summary(alone.best), "seconds": seconds, "candidates": done}
+    return {"alone": lab.summary(alone.best), "law": law_of(alone), "seconds": seconds, "options": options}
 
 
-def loop(lab: Lab, choose: bool, every: Sequence[str]) -> dict[str, Any]:
+def fit(lab: Lab, rank: int, known: Mapping[str, Any]) -> dict[str, Any]:
+    """The joint fit of a candidate, with its own errors of the estimate of the initial motion."""
+    lab.random.standard_normal(6 * rank)
+    own = known["options"][rank]
+    joint = lab.fitted([own["settings"]], [known["alone"]["family"]], known["law"])
+    return {"rank": rank, "kind": own["kind"], "predicted": own["predicted"], **lab.summary(joint.best)}
+
+
+def loop(lab: Lab, choose: bool, every: Sequence[str], most: int) -> dict[str, Any]:
     """Experiments until all constants are determined, chosen ones or random launches."""
     options: list[Option] = []
-    rounds, result = [], None
-    for number in range(EXPERIMENTS):
-        result = lab.fitted(options, every, result)
-        rounds.append(
-            {**lab.summary(result.best), "ties": result.ties, "kinds": [option.kind for option in options]}
-        )
-        if not undetermined(result.best, result.settings) and (number or not result.ties):
-            break
-        try:
-            selection = lab.selection(result, options, lab.settings.random.seed + number)
-        except InputError as error:  # nothing is left to determine
-            rounds[-1]["end"] = str(error)
-            break
-        launches = [option for option in selection.options if option.kind == "launch"]
-        options.append(selection.options[0] if choose else launches[int(lab.random.integers(len(launches)))])
-    return {"rounds": rounds}
+    experiments: list[Settings] = []
+    rounds, law = [], None
+    while True:
+        result = lab.fitted(experiments, every, law)
+        law = law_of(result)
+        kinds = [option.kind for option in options] or ["launch"] * len(experiments)
+        rounds.append({**lab.summary(result.best), "ties": result.ties, "kinds": kinds})
+        known = not undetermined(result.best, result.settings)
+        if len(rounds) == most or known and (experiments or not result.ties):
+            return {"rounds": rounds}
+        if choose:
+            seed = lab.settings.random.seed + len(experiments)
+            options.append(lab.selection(result, options, seed).options[0])
+            experiments.append(options[-1].settings)
+        else:
+            experiments.append(lab.random_launch())
 
 
-def tasks_of(names: Sequence[str]) -> Iterator[Task]:
-    """All tasks, the longest first."""
-    for kind, count in (("loop", 2), ("pool", CHUNKS)):
-        yield from (Task(name, kind, number) for number in range(count) for name in names)
+def tasks_of(names: Sequence[str], results: Mapping[str, Mapping[str, Any]]) -> Iterator[Task]:
+    """All tasks that are possible after those with results: rankings and loops first, then the fits of the best
+    candidate of each kind and of launches."""
+    yield from (Task(name, "ranking", 0) for name in names)
+    yield from (Task(name, "loop", number) for number in (1, 0) for name in names)
+    fits = []
+    for name in names:
+        seen = set[str]()
+        for rank, option in enumerate(results.get(str(Task(name, "ranking", 0)), {}).get("options", ())):
+            fits.append((rank > 0 and option["kind"] in seen - {"launch"}, rank, Task(name, "fit", rank)))
+            seen.add(option["kind"])
+    yield from (task for *_, task in sorted(fits, key=lambda each: each[:2]))
 
 
 def drawn(files: Sequence[Path], outside: int) -> dict[str, Config]:
@@ -238,15 +285,29 @@ def drawn(files: Sequence[Path], outside: int) -> dict[str, Config]:
 
 
 def finished(
-    jobs: int, settings: Mapping[str, Config], tasks: Mapping[str, Task]
-) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Results of tasks as they finish."""
-    if jobs == 1:
-        yield from ((key, run(settings[task.scene], task)) for key, task in tasks.items())
-        return
+    jobs: int, settings: Mapping[str, Config], kinds: Sequence[str], results: dict[str, dict[str, Any]]
+) -> Iterator[str]:
+    """Add the missing results of some kinds of tasks as they finish, and yield the names of the tasks."""
+    running: dict[Future[dict[str, Any]], str] = {}
     with ProcessPoolExecutor(jobs, get_context("spawn")) as processes:
-        running = {processes.submit(run, settings[task.scene], task): key for key, task in tasks.items()}
-        yield from ((running[future], future.result()) for future in as_completed(running))
+        while True:
+            for task in tasks_of(list(settings), results):
+                key = str(task)
+                if (
+                    len(running) >= jobs
+                    or task.kind not in kinds
+                    or key in results
+                    or key in running.values()
+                ):
+                    continue
+                known = results.get(str(Task(task.scene, "ranking", 0)))
+                running[processes.submit(run, settings[task.scene], task, known, EXPERIMENTS)] = key
+            if not running:
+                return
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                key = running.pop(future)
+                results[key] = future.result()
+                yield key
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -254,19 +315,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("files", type=Path, nargs="*", help="settings on top of config/config.yaml")
     parser.add_argument("--outside", type=int, default=3, help="materials outside the families")
     parser.add_argument("--jobs", type=int, default=1, help="parallel processes of one thread")
-    parser.add_argument("--kinds", nargs="+", default=["loop", "pool"], help="kinds of tasks")
+    parser.add_argument("--kinds", nargs="+", default=["ranking", "loop", "fit"], help="kinds of tasks")
     parser.add_argument("--out", type=Path, required=True, help="results, which a later run continues")
     parser.add_argument("--page", type=Path, help="Markdown page to write")
     options = parser.parse_args(arguments)
     settings = drawn(options.files, options.outside)
     results: dict[str, Any] = read_json(options.out) if options.out.is_file() else {}
-    missing = {str(task): task for task in tasks_of(list(settings)) if task.kind in options.kinds}
-    missing = {key: task for key, task in missing.items() if key not in results}
-    for key, result in finished(options.jobs, settings, missing):
-        results[key] = result
+    for key in finished(options.jobs, settings, options.kinds, results):
         write_json(options.out, results)
         print(key, flush=True)
-    by_task = {task: results[str(task)] for task in tasks_of(list(settings)) if str(task) in results}
+    by_task = {task: results[str(task)] for task in tasks_of(list(settings), results) if str(task) in results}
     materials = [Material.of(name, own, by_task) for name, own in settings.items()]
     files = " ".join(map(str, options.files))
     text = page(
@@ -283,7 +341,8 @@ class Material:
     """What the tasks of a material give.
 
     Attributes:
-        fits: joint fits of the pool with a finite result, in the order of the ranking.
+        fits: joint fits with a finite result, in the order of the ranking.
+        complete: whether all candidates have been fitted.
         alone: the fit to the first launch.
         rounds: of the loop with random launches, and of that with chosen experiments.
         inside: whether its family is a candidate.
@@ -295,6 +354,7 @@ class Material:
     inside: bool
     limit: float
     fits: list[dict[str, Any]]
+    complete: bool
     alone: dict[str, Any]
     rounds: list[list[dict[str, Any]]]
     refused: str
@@ -302,16 +362,15 @@ class Material:
     @classmethod
     def of(cls, name: str, settings: Config, results: Mapping[Task, dict[str, Any]]) -> "Material":
         own = {task: result for task, result in results.items() if task.scene == name}
-        pools = [result for result in own.values() if "candidates" in result]
-        fits = [fit for each in pools for fit in each["candidates"] if "std" in fit]
+        ranked = own.get(Task(name, "ranking", 0), {})
+        done = [result for task, result in own.items() if task.kind == "fit"]
+        complete = 0 < len(done) == len(ranked.get("options", ()))
+        fits = sorted((each for each in done if "std" in each), key=lambda each: each["rank"])
         family, known = settings.random.family(name), settings.identify
         rounds = [own.get(Task(name, "loop", k), {}).get("rounds", []) for k in range(2)]
-        refused = "; ".join(
-            dict.fromkeys(result["refused"] for result in own.values() if "refused" in result)
-        )
-        fits.sort(key=lambda fit: fit["rank"])
-        alone = pools[0]["alone"] if pools else {}
-        return cls(name, family, family in known.families, known.determined, fits, alone, rounds, refused)
+        refused = "; ".join(dict.fromkeys(each["refused"] for each in own.values() if "refused" in each))
+        inside, alone = family in known.families, ranked.get("alone", {})
+        return cls(name, family, inside, known.determined, fits, complete, alone, rounds, refused)
 
     def of_kinds(self, *kinds: str) -> list[dict[str, Any]]:
         return [fit for fit in self.fits if fit["kind"] in kinds]
@@ -339,7 +398,7 @@ class Material:
         parts = self.fits[:1]
         stds = [[log_std(self.alone)] if self.alone else [], [log_std(fit, "predicted") for fit in parts]]
         stds += [list(map(log_std, some)) for some in (parts, self.of_kinds("launch"))]
-        stds += [[min(map(log_std, self.fits))] if parts else []]
+        stds += [[min(map(log_std, self.fits))] if self.complete else []]
         return [
             self.name,
             parts[0]["kind"] if parts else self.refused,
@@ -372,7 +431,8 @@ PAGE = """\
 
 Standard deviations (std) are geometric means over the constants of those of their logarithms. Errors are root mean
 squares of the logarithms of their ratios to the true ones. The last columns are the numbers of experiments until all
-constants are determined, where {more} stands for more than {limit}.
+constants are determined, where {more} stands for more than {limit}. The best in hindsight is that of all candidates, of
+materials where all have been fitted.
 """
 
 
@@ -385,41 +445,51 @@ def page(materials: Sequence[Material], command: str) -> str:
     chosen, random = ([n for each in materials for n in each.experiments(choose)] for choose in (True, False))
     distinct = [own for each in materials for own in each.distinguished()]
 
-    def ratio(measure: Callable[[dict[str, Any]], float], some: Sequence[Material], *kinds: str) -> str:
-        logs = [value for each in some for value in each.over_random(measure, *kinds)]
-        return f"{math.exp(np.mean(logs)):.2f}" if logs else ""
+    def ratio(logs: Sequence[float]) -> list[str]:
+        return [f"{math.exp(np.mean(logs)):.2f}" if logs else "", str(len(logs))]
 
-    best = [log_std(each.fits[0]) - min(map(log_std, each.fits)) for each in materials if each.fits]
+    def against(
+        measure: Callable[[dict[str, Any]], float], some: Sequence[Material], *kinds: str
+    ) -> list[str]:
+        return ratio([value for each in some for value in each.over_random(measure, *kinds)])
+
+    def median(numbers: Sequence[int]) -> list[str]:
+        return [f"{np.median(numbers):g}" if numbers else "", str(len(numbers))]
+
+    best = [log_std(each.fits[0]) - min(map(log_std, each.fits)) for each in materials if each.complete]
     rows = [
-        ["std, chosen experiment over random launches", "0.6", ratio(log_std, materials)],
-        ["std, chosen launch over random launches", "0.6", ratio(log_std, materials, "launch", "turned")],
-        [
-            "std, chosen experiment over the best in hindsight",
-            "1.1",
-            best and f"{math.exp(np.mean(best)):.2f}",
-        ],
-        ["errors, chosen experiment over random launches", "", ratio(log_error, inside)],
-        ["experiments, median of chosen ones", "half of random", chosen and f"{np.median(chosen):g}"],
-        ["experiments, median of random launches", "", random and f"{np.median(random):g}"],
+        ["std, chosen experiment over random launches", "0.6", *against(log_std, materials)],
+        ["std, chosen launch over random launches", "0.6", *against(log_std, materials, "launch", "turned")],
+        ["std, chosen experiment over the best in hindsight", "1.1", *ratio(best)],
+        ["errors, chosen experiment over random launches", "", *against(log_error, inside)],
+        ["experiments, median of chosen ones", "half of random", *median(chosen)],
+        ["experiments, median of random launches", "", *median(random)],
         *(
             [
                 f"predicted over reported std, {name}",
                 "1",
-                fits and f"{np.exp(np.quantile(calibration, q)):.2f}",
+                f"{np.exp(np.quantile(calibration, q)):.2f}" if fits else "",
+                f"{len(materials)}, {len(fits)} fits",
             ]
             for name, q in (("10th percentile", 0.1), ("median", 0.5), ("90th percentile", 0.9))
         ),
         *(
-            [f"errors within {k} predicted std", n, z and f"{np.mean(np.less(z, k)):.2f}"]
+            [
+                f"errors within {k} predicted std",
+                n,
+                f"{np.mean(np.less(z, k)):.2f}" if z else "",
+                f"{len(inside)}, {len(z)} constants",
+            ]
             for k, n in NORMAL.items()
         ),
         [
             "families distinguished after two experiments",
             "22 of 24",
-            distinct and f"{sum(distinct)} of {len(distinct)}",
+            f"{sum(distinct)} of {len(distinct)}" if distinct else "",
+            str(len(distinct)),
         ],
     ]
-    measures = as_markdown(["measure", "goal", "result"], [row for row in rows if row[2]])
+    measures = as_markdown(["measure", "goal", "result", "materials"], [row for row in rows if row[2]])
     table = as_markdown(HEADER, [each.row() for each in materials])
     return PAGE.format(
         command=command,

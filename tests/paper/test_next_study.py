@@ -41,28 +41,30 @@ def test_the_page_has_the_measures_of_the_issue(materials):
     chosen = fit(0, "press", 0.1, 0.05)
     launches = [fit(1, "launch", 0.2, 0.2, 0.2), fit(2, "launch", 0.2, 0.2, 0.2)]
     best = fit(3, "hang", 0.05, 0.1, 0.3)
-    alone = {"std": {"G": 0.4, "K": 1.6}}
-    pools = [{"alone": alone, "candidates": own} for own in ([best, chosen], launches)]
+    fits = [chosen, *launches, best]
+    ranking = {"alone": {"std": {"G": 0.4, "K": 1.6}}, "options": [{"kind": each["kind"]} for each in fits]}
     known = {"family": "hencky", "ties": [], "std": {"G": 0.05, "K": 0.09}}
     unsure = known | {"std": {"G": 0.05, "K": 0.5}}
-    results = {Task(name, "pool", k): own for k, own in enumerate(pools)}
+    results = {Task(name, "fit", k): own for k, own in enumerate(fits)} | {Task(name, "ranking", 0): ranking}
     results[Task(name, "loop", 1)] = {"rounds": [unsure, known]}
     results[Task(name, "loop", 0)] = {"rounds": [unsure] * study.EXPERIMENTS}
     text = page([Material.of(name, settings, results)], "command")
     for row in (
-        "std, chosen experiment over random launches | 0.6 | 0.50",
-        "std, chosen launch over random launches | 0.6 | 1.00",
-        "std, chosen experiment over the best in hindsight | 1.1 | 2.00",
-        "errors, chosen experiment over random launches |  | 0.50",
-        "experiments, median of chosen ones | half of random | 2",
-        f"experiments, median of random launches |  | {study.EXPERIMENTS + 1}",
-        "predicted over reported std, median | 1 | 1.00",
-        "errors within 1 predicted std | 0.68 | 0.50",
-        "families distinguished after two experiments | 22 of 24 | 1 of 1",
+        "std, chosen experiment over random launches | 0.6 | 0.50 | 1",
+        "std, chosen launch over random launches | 0.6 | 1.00 | 1",
+        "std, chosen experiment over the best in hindsight | 1.1 | 2.00 | 1",
+        "errors, chosen experiment over random launches |  | 0.50 | 1",
+        "experiments, median of chosen ones | half of random | 2 | 1",
+        f"experiments, median of random launches |  | {study.EXPERIMENTS + 1} | 1",
+        "predicted over reported std, median | 1 | 1.00 | 1, 4 fits",
+        "errors within 1 predicted std | 0.68 | 0.50 | 1, 8 constants",
+        "families distinguished after two experiments | 22 of 24 | 1 of 1 | 1",
     ):
         assert f"| {row} |" in text, text
-    assert f"| {name} | press | 80 % | 10 % | 20 % | 40 % | 10 % | 2 | 7 |" in text
-    refused = Material.of(name, settings, {Task(name, "pool", 0): {"refused": "no launch"}})
+    assert f"| {name} | press | 80 % | 10 % | 20 % | 40 % | 10 % | 2 | {study.EXPERIMENTS + 1} |" in text
+    del results[Task(name, "fit", 3)]
+    assert "hindsight |" not in page([Material.of(name, settings, results)], "command")
+    refused = Material.of(name, settings, {Task(name, "ranking", 0): {"refused": "no launch"}})
     assert "no launch" in page([refused], "command") and math.isfinite(len(refused.fits))
 
 
@@ -74,7 +76,7 @@ def test_materials_outside_the_families_are_the_last_ones(materials):
 
 
 def test_a_tiny_study_runs_and_continues(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(study, "CHUNKS", 1)
+
     monkeypatch.setattr(study, "EXPERIMENTS", 2)
 
     def with_few_families(files, outside):
@@ -91,10 +93,10 @@ def test_a_tiny_study_runs_and_continues(tmp_path, monkeypatch, capsys):
     command = [str(overlay), "--outside", "0", "--out", str(out), "--page", str(text)]
     main(command)
     results = read_json(out)
-    assert len(results) == 3 and not any("refused" in result for result in results.values())
+    assert len(results) == 6 and not any("refused" in result for result in results.values())
     assert "Task(" in capsys.readouterr().out
-    (pool,) = (result for result in results.values() if "candidates" in result)
-    assert {each["kind"] for each in pool["candidates"]} == {"launch", "press", "hang"}
+    fits = [result for result in results.values() if "rank" in result]
+    assert {each["kind"] for each in fits} == {"launch", "press", "hang"}
     assert "| std, chosen experiment over random launches | 0.6 | " in text.read_text()
     main(command)
     assert "Task(" not in capsys.readouterr().out
