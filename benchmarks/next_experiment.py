@@ -34,6 +34,7 @@ from neuma_lib.coupling.bodies import coloured_solid
 from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.data.blender.appearance import colors_at
+from neuma_lib.device import choose_device
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.evaluation.text_tables import as_markdown
 from neuma_lib.fitting.candidate_experiments import as_cameras, draw_starts, placed
@@ -77,10 +78,11 @@ class Lab:
     Args:
         settings: with the random scenes.
         name: of a scene.
+        device: of simulations and renders.
     """
 
-    def __init__(self, settings: Config, name: str):
-        self.settings, self.scene = settings, settings.scene(name)
+    def __init__(self, settings: Config, name: str, device: torch.device | str = "cpu"):
+        self.settings, self.scene, self.device = settings, settings.scene(name), device
         number = list(settings.random_scenes).index(name)
         self.random = np.random.default_rng([settings.random.seed, number])
         simulation = settings.simulation
@@ -102,7 +104,7 @@ class Lab:
         x0 = sample_volume(mesh, count, seed=seed)
         colors = torch.from_numpy(colors_at(mesh, x0, AppearanceConfig(**scene.plain()["appearance"])))
         body = coloured_solid(mesh, torch.as_tensor(x0, dtype=torch.float32), 1000.0, colors)
-        return replace(body, gaussians=body.gaussians.to(dtype=torch.float32), affine=False)
+        return replace(body.to(torch.float32, self.device), affine=False)
 
     @torch.no_grad()
     def film(
@@ -117,13 +119,13 @@ class Lab:
         """An estimate of the initial motion, the reconstruction at the start, and the video."""
         count, pixels = self.settings.dataset.frames, self.settings.dataset.dynamic.width
         frames = tuple(round(k * steps / (count - 1)) for k in range(count))
-        law, start = analytic_law(self.law, model.dt), truth.state(velocity, spin)
+        law, start = analytic_law(self.law, model.dt).to(self.device), truth.state(velocity, spin)
         path = rollout(model, law, start, steps=steps, frames=frames, total=True)
-        like = Cameras(torch.eye(4)[None], torch.eye(3)[None], pixels, pixels)
-        cameras = as_cameras(video_views(path.x.flatten(0, 1).numpy(), 1, pixels, pixels), like)
+        like = Cameras(torch.eye(4)[None], torch.eye(3)[None], pixels, pixels).to(self.device)
+        cameras = as_cameras(video_views(path.x.flatten(0, 1).cpu().numpy(), 1, pixels, pixels), like)
         images = truth.particle_gs(cameras)(path.x, path.stretch)
-        axes = cameras.viewmats[0, :3, :3].double().numpy()
-        centre = (body.mass @ body.x0 / body.mass.sum()).double().numpy()
+        axes = cameras.viewmats[0, :3, :3].double().cpu().numpy()
+        centre = (body.mass @ body.x0 / body.mass.sum()).double().cpu().numpy()
         std = np.zeros(6) if model.clamps else STD
         exact = InitialMotion(np.array(velocity), np.array(spin), centre, axes, std)
         return exact.moved(self.random.standard_normal(6)), body, Observation(frames, images, cameras)
@@ -191,15 +193,18 @@ def law_of(result: Identified) -> dict[str, Any]:
     return dict(result.best.family.law_spec(result.best.values))
 
 
-def run(settings: Config, task: Task, known: Mapping[str, Any] | None, experiments: int) -> dict[str, Any]:
+def run(
+    settings: Config, task: Task, known: Mapping[str, Any] | None, experiments: int, device: torch.device
+) -> dict[str, Any]:
     """The result of a task in plain values.
 
     Args:
         known: result of the ranking of the material, for a fit.
         experiments: at most of a loop, with the first one.
+        device: of simulations and renders.
     """
     torch.set_num_threads(1)
-    lab = Lab(settings, task.scene)
+    lab = Lab(settings, task.scene, device)
     every = list(settings.identify.families)
     try:
         if task.kind == "fit":
@@ -285,7 +290,11 @@ def drawn(files: Sequence[Path], outside: int) -> dict[str, Config]:
 
 
 def finished(
-    jobs: int, settings: Mapping[str, Config], kinds: Sequence[str], results: dict[str, dict[str, Any]]
+    jobs: int,
+    device: torch.device,
+    settings: Mapping[str, Config],
+    kinds: Sequence[str],
+    results: dict[str, dict[str, Any]],
 ) -> Iterator[str]:
     """Add the missing results of some kinds of tasks as they finish, and yield the names of the tasks."""
     running: dict[Future[dict[str, Any]], str] = {}
@@ -301,7 +310,8 @@ def finished(
                 ):
                     continue
                 known = results.get(str(Task(task.scene, "ranking", 0)))
-                running[processes.submit(run, settings[task.scene], task, known, EXPERIMENTS)] = key
+                own = processes.submit(run, settings[task.scene], task, known, EXPERIMENTS, device)
+                running[own] = key
             if not running:
                 return
             for future in wait(running, return_when=FIRST_COMPLETED).done:
@@ -315,13 +325,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("files", type=Path, nargs="*", help="settings on top of config/config.yaml")
     parser.add_argument("--outside", type=int, default=3, help="materials outside the families")
     parser.add_argument("--jobs", type=int, default=1, help="parallel processes of one thread")
+    parser.add_argument("--device", default="cpu", help="of simulations and renders")
     parser.add_argument("--kinds", nargs="+", default=["ranking", "loop", "fit"], help="kinds of tasks")
     parser.add_argument("--out", type=Path, required=True, help="results, which a later run continues")
     parser.add_argument("--page", type=Path, help="Markdown page to write")
     options = parser.parse_args(arguments)
     settings = drawn(options.files, options.outside)
     results: dict[str, Any] = read_json(options.out) if options.out.is_file() else {}
-    for key in finished(options.jobs, settings, options.kinds, results):
+    for key in finished(options.jobs, choose_device(options.device), settings, options.kinds, results):
         write_json(options.out, results)
         print(key, flush=True)
     by_task = {task: results[str(task)] for task in tasks_of(list(settings), results) if str(task) in results}
