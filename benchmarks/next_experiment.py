@@ -36,6 +36,7 @@ from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.data.blender.appearance import colors_at
 from neuma_lib.device import choose_device
 from neuma_lib.errors import InputError, NonFiniteError
+from neuma_lib.evaluation.calibration import GRID, quantiles_of
 from neuma_lib.evaluation.text_tables import as_markdown
 from neuma_lib.fitting.candidate_experiments import as_cameras, draw_starts, placed
 from neuma_lib.fitting.choose_next import Option, Selection, choose_next, read_rivals
@@ -428,7 +429,7 @@ def log_error(fit: Mapping[str, Any]) -> float:
     return 0.5 * math.log(np.mean(np.square(list(fit["error"].values()))))
 
 
-NORMAL = {1: "0.68", 2: "0.95"}  # share of a normal distribution within so many standard deviations
+SHARES = {0.5: "0.45 to 0.55", 0.8: "0.75 to 0.85", 0.95: "0.92 to 0.98"}  # goals of calibrated intervals
 STDS = ("std: one launch", "predicted", "chosen", "random", "best")
 HEADER = ("material", "chosen", *STDS, "experiments: chosen", "random")
 PAGE = """\
@@ -443,15 +444,23 @@ PAGE = """\
 Standard deviations (std) are geometric means over the constants of those of their logarithms. Errors are root mean
 squares of the logarithms of their ratios to the true ones. The last columns are the numbers of experiments until all
 constants are determined, where {more} stands for more than {limit}. The best in hindsight is that of all candidates, of
-materials where all have been fitted.
+materials where all have been fitted. Intervals extend by calibrated multiples of the predicted standard deviations
+([calibrated intervals](../calibration.md)).
 """
 
 
 def page(materials: Sequence[Material], command: str) -> str:
     """Measures over all materials, and a row for each."""
     inside = [each for each in materials if each.inside]
-    fits, known = ([fit for each in some for fit in each.fits] for some in (materials, inside))
-    z = [abs(fit["error"][key]) / fit["predicted"][key] for fit in known for key in fit["error"]]
+    fits = [fit for each in materials for fit in each.fits]
+    known = {
+        "": [fit for each in inside for fit in each.fits],
+        " of the chosen": [fit for each in inside for fit in each.fits[:1]],
+    }
+    z = {
+        name: [abs(fit["error"][key]) / fit["predicted"][key] for fit in some for key in fit["error"]]
+        for name, some in known.items()
+    }
     calibration = [log_std(fit, "predicted") - log_std(fit) for fit in fits]
     chosen, random = ([n for each in materials for n in each.experiments(choose)] for choose in (True, False))
     distinct = [own for each in materials for own in each.distinguished()]
@@ -486,12 +495,13 @@ def page(materials: Sequence[Material], command: str) -> str:
         ),
         *(
             [
-                f"errors within {k} predicted std",
-                n,
-                f"{np.mean(np.less(z, k)):.2f}" if z else "",
-                f"{len(inside)}, {len(z)} constants",
+                f"errors{name} in the predicted {100 * level:.0f} % interval",
+                goal,
+                f"{np.mean(np.less(own, quantiles_of(GRID).at(level))):.2f}" if own else "",
+                f"{len(inside)}, {len(own)} constants",
             ]
-            for k, n in NORMAL.items()
+            for name, own in z.items()
+            for level, goal in SHARES.items()
         ),
         [
             "families distinguished after two experiments",

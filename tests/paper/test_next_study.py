@@ -57,7 +57,8 @@ def test_the_page_has_the_measures_of_the_issue(materials):
         "experiments, median of chosen ones | half of random | 2 | 1",
         f"experiments, median of random launches |  | {study.EXPERIMENTS + 1} | 1",
         "predicted over reported std, median | 1 | 1.00 | 1, 4 fits",
-        "errors within 1 predicted std | 0.68 | 0.50 | 1, 8 constants",
+        "errors in the predicted 95 % interval | 0.92 to 0.98 | 1.00 | 1, 8 constants",
+        "errors of the chosen in the predicted 50 % interval | 0.45 to 0.55 | 0.50 | 1, 2 constants",
         "families distinguished after two experiments | 22 of 24 | 1 of 1 | 1",
     ):
         assert f"| {row} |" in text, text
