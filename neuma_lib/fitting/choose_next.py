@@ -140,7 +140,8 @@ def read_fit(record: Mapping[str, Any], settings: IdentifyConfig) -> FamilyFit:
         raise InputError("identified.json", problem, _IDENTIFY)
     family = Family(name, settings.families[name].plain())
     values, covariance = np.array(best["values"]), np.array(best["covariance"])
-    return FamilyFit(family, family.bounded(values), covariance=covariance)
+    loss = record["best"].get("loss", math.inf)
+    return FamilyFit(family, family.bounded(values), loss, covariance=covariance)
 
 
 def read_rivals(

@@ -18,8 +18,11 @@ Derivatives are differences as wide as the standard deviations of the constants,
 less. A constant on a plateau of the images, such as a yield stress that is hardly reached, has no information then,
 although it has a derivative.
 
-All of this is to first order about the identified constants, and assumes that an experiment is modelled as well as the
-existing ones.
+An experiment with large deformations is simulated less accurately than the existing ones. The squared difference of its
+images on a coarser grid, as far as it exceeds that of the existing videos, is added to the mean squared residual of the
+fit, and s^2 increases in proportion (`Knowledge.noise_in`).
+
+All of this is to first order about the identified constants.
 """
 
 import math
@@ -48,6 +51,7 @@ from neuma_lib.sim.state import State
 from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.observation import Observation
 
+_COARSER = 1.5  # ratio of the cell sizes whose images are compared
 _NOISE_RANGE = 1e12  # largest ratio of the noise to the mean curvature, and its inverse
 
 
@@ -96,7 +100,8 @@ class Knowledge:
 
     fit: FamilyFit  # the identified family and constants, with the covariance of the unbounded ones
     settings: IdentifyConfig  # those of the identification
-    noise: float  # variance s^2 of the residuals per unit of curvature
+    noise: float  # variance s^2 of the residuals of the existing videos per unit of curvature
+    difference: float  # mean squared difference of their images on a coarser grid
     _rivals: list[_Rival] = field(default_factory=list)
 
     @classmethod
@@ -126,7 +131,8 @@ class Knowledge:
             video.weight = (videos[0].fitted_pixels / video.fitted_pixels) ** 0.5
         curvature = _linearised(fit, videos, settings).curvature
         noise = matched_noise(curvature, fit.covariance, settings.spread)
-        own = cls(fit, settings, noise)
+        difference = float(np.mean([_coarser_difference(fit, video) for video in videos]))
+        own = cls(fit, settings, noise, difference)
         for family, values in rivals:
             run = FamilyRun(family, videos, [len(video.frames) for video in videos], settings)
             try:
@@ -150,19 +156,31 @@ class Knowledge:
         """
         k = len(self.fit.family.constants)
         video = experiment.residuals(self.settings)
-        gained = information(self._linearised(video).curvature, self.noise, k)
+        curvature = self._linearised(video).curvature
+        noise = self.noise_in(video)
+        gained = information(curvature, noise, k)
         if of is not None:
-            gained = gained - information(
-                self._linearised(of.residuals(self.settings)).curvature, self.noise, k
-            )
+            gained = gained - information(self._linearised(of.residuals(self.settings)).curvature, noise, k)
         covariance = added(self.fit.covariance, gained)
-        evidence = {rival.family.name: self._evidence(rival, video) for rival in self._rivals}
+        evidence = {rival.family.name: self._evidence(rival, video, noise) for rival in self._rivals}
         return Forecast(replace(self.fit, covariance=covariance), gained, evidence)
+
+    def noise_in(self, video: VideoResiduals) -> float:
+        """Variance of the residuals per unit of curvature in a video of the identified law.
+
+        With the mean squared residual r of the fit, and the mean squared differences d of the existing videos and d' of
+        this one between the grid and a coarser one, it is that of the existing videos times
+        1 + max(d' - d, 0) / max(r, d).
+        """
+        excess = _coarser_difference(self.fit, video) - self.difference
+        if not excess > 0:  # or both are infinite
+            return self.noise
+        return self.noise * (1 + excess / max(self.fit.loss, self.difference))
 
     def _linearised(self, video: VideoResiduals) -> Linearisation:
         return _linearised(self.fit, [video], self.settings)
 
-    def _evidence(self, rival: _Rival, video: VideoResiduals) -> float:
+    def _evidence(self, rival: _Rival, video: VideoResiduals, noise: float) -> float:
         """Expected logarithm of the Bayes factor in a video of the identified family against a rival.
 
         The rival changes its constants within the information of the existing videos, and the motion within its
@@ -174,17 +192,24 @@ class Knowledge:
         except NonFiniteError:
             return math.inf
         k = len(rival.family.constants)
-        H, g = fit.curvature / self.noise, fit.slope / self.noise
+        H, g = fit.curvature / noise, fit.slope / noise
         H += np.eye(len(H))
         H[:k, :k] += rival.information - np.eye(k)
-        return 0.5 * max(fit.cost / self.noise - g @ np.linalg.solve(H, g), 0.0)
+        return 0.5 * max(fit.cost / noise - g @ np.linalg.solve(H, g), 0.0)
+
+
+def _candidate(fit: FamilyFit) -> Candidate:
+    return Candidate(fit.family.law_spec(fit.values), np.zeros(NUISANCES))
+
+
+def _coarser_difference(fit: FamilyFit, video: VideoResiduals) -> float:
+    return video.coarser_difference(_candidate(fit), _COARSER)
 
 
 def _linearised(fit: FamilyFit, videos: Sequence[VideoResiduals], settings: IdentifyConfig) -> Linearisation:
     """Replace videos by the images of a fit, and linearise them there, with residuals of 0."""
-    at = Candidate(fit.family.law_spec(fit.values), np.zeros(NUISANCES))
     for video in videos:
-        if not video.observe(at):
+        if not video.observe(_candidate(fit)):
             raise NonFiniteError(fit.family.name, "the simulation with the identified constants diverges")
     run = FamilyRun(fit.family, videos, [len(video.frames) for video in videos], settings)
     return run.linearise_at(fit.values, fit.covariance)

@@ -170,6 +170,16 @@ class VideoResiduals:
             self._observed = [own / self.weight + images for own, images in pairs]
         return residual is not None
 
+    def coarser_difference(self, at: Candidate, ratio: float) -> float:
+        """Mean squared difference between the observed images and those of a candidate with ``ratio`` times the cell
+        size, infinite if its rollout diverges."""
+        on = replace(self._coarse, model=replace(self._coarse.model, grid=round(self.model.grid / ratio)))
+        count = len(self.frames)
+        (residual,) = self._residuals([at], *self._paths([at], count, on), on, count)
+        if residual is None:
+            return math.inf
+        return float(torch.cat([r.flatten() for r in residual]).double().square().mean()) / self.weight**2
+
     def set_friction(self, friction: float) -> None:
         """Set the Coulomb coefficient of all obstacles in the simulations that follow."""
         self.model = self.model.with_friction(friction)

@@ -95,6 +95,39 @@ def log_stds(fit: FamilyFit) -> np.ndarray:
     return np.sqrt(np.diag(fit.log_covariance(lambda values: values)[1]))
 
 
+def at(fit: FamilyFit) -> Candidate:
+    return Candidate(fit.family.law_spec(fit.values), np.zeros(NUISANCES))
+
+
+def test_a_coarser_grid_changes_the_images_of_an_experiment(known):
+    """Slow twin: images of two simulators."""
+    own, one = experiment(), at(known.fit)
+    coarse = replace(own, model=replace(MODEL, grid=round(MODEL.grid / 1.5)))
+    # The same black video is subtracted from both.
+    ((fine,),), ((other,),) = (
+        each.residuals(settings()).residuals([one], len(FRAMES)) for each in (own, coarse)
+    )
+    video = own.residuals(settings())
+    assert video.observe(one)
+    video.weight = 0.5
+    expected = float((fine - other).double().square().mean())
+    assert video.coarser_difference(one, 1.5) == pytest.approx(expected, rel=1e-4) and expected > 0
+    assert video.coarser_difference(one, 1.0) == pytest.approx(0, abs=1e-4 * expected)
+
+
+def test_noise_increases_with_the_error_of_the_grid(known):
+    """By the ratio of the differences where they exceed the residual, in proportion to their excess otherwise."""
+    same, fast = (experiment(v0).residuals(settings()) for v0 in (V0, (0.2, -2.5, 0.3)))
+    assert same.observe(at(known.fit)) and fast.observe(at(known.fit))
+    assert known.noise_in(same) == pytest.approx(known.noise)
+    before, after = known.difference, fast.coarser_difference(at(known.fit), 1.5)
+    assert after > before > known.fit.loss
+    assert known.noise_in(fast) == pytest.approx(known.noise * after / before)
+    rough = replace(known, fit=replace(known.fit, loss=10 * before))
+    assert rough.noise_in(fast) == pytest.approx(known.noise * (1 + (after - before) / (10 * before)))
+    assert rough.noise_in(same) == pytest.approx(known.noise)
+
+
 @pytest.mark.parametrize("v0", [(0.2, -2.5, 0.3), (0.0, -0.5, 0.0)])
 def test_predicted_deviations_are_those_that_a_joint_fit_reports(alone, known, v0):
     """A fast launch and a slow one with little information. The jackknife over the few blocks that show the ball has a
@@ -164,7 +197,8 @@ def test_evidence_is_that_of_a_fit_of_the_rival(known):
     for experiments in ([experiment()], [experiment(), second]):
         videos = [each.residuals(chosen) for each in experiments]
         for each in videos:
-            assert each.observe(Candidate(known.fit.family.law_spec(known.fit.values), np.zeros(NUISANCES)))
+            assert each.observe(at(known.fit))
+            each.weight = math.sqrt(known.noise / knowing.noise_in(each))
         run = FamilyRun(rival, videos, [len(FRAMES)] * len(videos), chosen)
         run.imitate(known.fit.values, known.noise)
         costs.append(0.5 * (run.fit.cost / known.noise + float(run.deviations @ run.deviations)))
