@@ -128,7 +128,7 @@ class VideoResiduals:
         self._total, self._axes = settings.covariance_from == "total", observed[0].cameras.viewmats[0, :3, :3]
         self._steps, self._own_frames = rendered_steps(observed), [each.frames for each in observed]
         self._ends = [[f + each.exposure[-1] for f in each.frames] for each in observed]
-        self._flights: dict[tuple[bool, bytes], Trajectory] = {}
+        self._flights: dict[tuple[bool, int, bytes], Trajectory] = {}
         self._flown: dict[tuple[bool, bytes, int, int], Tensor] = {}
         self._last = [  # step at which the last exposure of the frames up to each ends
             max(
@@ -326,7 +326,7 @@ class VideoResiduals:
         if start.bodies:
             return Trajectory((), *(value[:0, None] for value in start.motion))
         (law,) = laws
-        key = (on is self._fine, one.deviations[:MOTION].tobytes())
+        key = (on is self._fine, on.model.grid, one.deviations[:MOTION].tobytes())
         if key not in self._flights:
             flight = rigid_flight(on.model, start, self._steps_of(on, self._steps), self._total)
             clear = first_contact(on.model, flight.x, start.vol0, flight.frames)

@@ -50,10 +50,11 @@ def test_the_page_has_the_measures_of_the_issue(materials):
     results[Task(name, "loop", 0)] = {"rounds": [unsure] * study.EXPERIMENTS}
     text = page([Material.of(name, settings, results)], "command")
     for row in (
-        "std, chosen experiment over random launches | 0.6 | 0.50 | 1",
-        "std, chosen launch over random launches | 0.6 | 1.00 | 1",
-        "std, chosen experiment over the best in hindsight | 1.1 | 2.00 | 1",
-        "errors, chosen experiment over random launches |  | 0.50 | 1",
+        "std, chosen experiment over random launches | 0.6 | 0.50 [0.50, 0.50] | 1",
+        "std, chosen launch over random launches | 0.6 | 1.00 [1.00, 1.00] | 1",
+        "std, chosen experiment over the best in hindsight | 1.1 | 2.00 [2.00, 2.00] | 1",
+        "errors, chosen experiment over random launches |  | 0.50 [0.50, 0.50] | 1",
+        "errors, chosen launch over random launches |  | 1.00 [1.00, 1.00] | 1",
         "experiments, median of chosen ones | half of random | 2 | 1",
         f"experiments, median of random launches |  | {study.EXPERIMENTS + 1} | 1",
         "predicted over reported std, median | 1 | 1.00 | 1, 4 fits",
