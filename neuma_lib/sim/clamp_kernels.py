@@ -1,7 +1,6 @@
 """Clamped particles and held nodes as Warp functions. `clamps.Clamp` has the rules."""
 
 import functools
-from collections.abc import Sequence
 from types import SimpleNamespace
 
 import numpy as np
@@ -31,8 +30,10 @@ def hold_type(dtype: torch.dtype) -> type:
     return Hold
 
 
-def holds(clamps: Sequence[Clamp], times: Sequence[float], dt: float, dtype: torch.dtype) -> np.ndarray:
-    """Clamps in the steps from some times [s] on, as a structured array (times, clamps) of `hold_type`."""
+@functools.lru_cache(maxsize=64)  # many simulations of a model have the same segments of steps
+def holds(clamps: tuple[Clamp, ...], times: tuple[float, ...], dt: float, dtype: torch.dtype) -> np.ndarray:
+    """Clamps in the steps from some times [s] on, as a structured array (times, clamps) of `hold_type`, which is not to
+    be changed."""
     result = np.zeros((len(times), max(1, len(clamps))), dtype=hold_type(dtype).numpy_dtype())
     for k, clamp in enumerate(clamps):
         for n, time in enumerate(times if clamp.moves else times[:1]):
@@ -40,6 +41,7 @@ def holds(clamps: Sequence[Clamp], times: Sequence[float], dt: float, dtype: tor
             for name, value in zip(("A", "centre", "velocity"), clamp.in_step(time, dt), strict=True):
                 result[name][place, k] = value.numpy()
         result["holds"][:, k] = [clamp.holds(time, dt) for time in times]
+    result.setflags(write=False)
     return result
 
 

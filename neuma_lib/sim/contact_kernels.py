@@ -53,8 +53,10 @@ def distances(colliders: Sequence[Collider]) -> np.ndarray:
     return np.concatenate(grids or [np.zeros(1, np.float32)])
 
 
-def obstacles(colliders: Sequence[Collider], times: Sequence[float], dtype: torch.dtype) -> np.ndarray:
-    """Colliders at some times [s] as a structured array (times, colliders) in the layout of `obstacle_type`."""
+@functools.lru_cache(maxsize=64)  # many simulations of a model have the same segments of steps
+def obstacles(colliders: tuple[Collider, ...], times: tuple[float, ...], dtype: torch.dtype) -> np.ndarray:
+    """Colliders at some times [s] as a structured array (times, colliders) in the layout of `obstacle_type`, which is
+    not to be changed."""
     result = np.zeros((len(times), len(colliders)), dtype=obstacle_type(dtype).numpy_dtype())
     first = 0
     for k, collider in enumerate(colliders):
@@ -73,6 +75,7 @@ def obstacles(colliders: Sequence[Collider], times: Sequence[float], dtype: torc
                 column[name][slice(n, n + 1 if collider.moves else None)] = value.numpy()
         column["damping"] = collider.damping
         column["friction"] = min(collider.friction, STICKING)
+    result.setflags(write=False)
     return result
 
 

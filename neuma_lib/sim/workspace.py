@@ -262,7 +262,7 @@ class Workspace:
 
     def _obstacles(self, times: Sequence[float]) -> wp.array:
         """Colliders at some times [s], with the friction of each copy."""
-        poses = obstacles(self.size.model.obstacles, times, self.size.dtype)
+        poses = obstacles(self.size.model.obstacles, tuple(times), self.size.dtype)
         rows = np.repeat(poses, self.size.copies, axis=0)
         of_obstacles = self.frictions[:, : len(self.size.model.obstacles)]
         rows["friction"] = np.tile(np.minimum(of_obstacles, STICKING), (len(times), 1))
@@ -274,7 +274,7 @@ class Workspace:
         """Clamps in the steps from some times [s] on."""
         model, dtype = self.size.model, self.size.dtype
         return wp.array(
-            holds(model.clamps, times, model.dt, dtype),
+            holds(model.clamps, tuple(times), model.dt, dtype),
             dtype=hold_type(dtype),
             device=wp.device_from_torch(self.size.device),
         )
