@@ -253,7 +253,7 @@ def test_a_chosen_launch_becomes_a_scene_of_the_same_material(project, capsys):
     assert settings.video_scenes("JellyDuck") == ["JellyDuck", "Second"]
     scene = settings.scene("Second")
     assert scene.height == 0.5 and scene.velocity == (0.0, -2.0, 0.0) and scene.steps == 256
-    assert scene.law == settings.scene("JellyDuck").law and settings.identify.start_from_first_video
+    assert scene.law == settings.scene("JellyDuck").law
     assert main(["new", "scene", "Third", "--from", str(folder), "--rank", "2"]) == 1
     assert main(["new", "scene", "Third", "--from", "results/ClayCat"]) == 1
     assert "neuma next" in capsys.readouterr().err

@@ -54,9 +54,6 @@ class IdentifyConfig(Section):
         (6, 12, 24, 96), "widths of the images that are fitted in turn", min_length=1
     )
     iterations: int = internal(10, "maximum number of Levenberg-Marquardt steps for each width", ge=1)
-    start_from_first_video: bool = internal(
-        False, "fits to several videos also start from the constants of a fit to the first one"
-    )
     level_plateaus: bool = internal(
         False, "plateaus of the loss are measured above its slope where a fit ends before its minimum"
     )

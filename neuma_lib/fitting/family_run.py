@@ -479,14 +479,15 @@ class FamilyRun:
         return averaged(images, self.videos[self._places[at][0]].sizes[self._level])
 
     def _held_out(self) -> float:
-        """Mean squared residual of the frames after the fitted ones, infinite if a rollout diverges there."""
+        """Mean squared residual of the frames after the fitted ones relative to the noise, infinite if a rollout
+        diverges there."""
         (residual,) = self._simulate([self._u], [len(video.frames) for video in self.videos])
         if residual is None:
             return math.inf
         later = [(v, r[rows:].flatten()) for r, (v, _, rows) in zip(residual, self._places, strict=True)]
         losses = [
             float(torch.cat([r for owner, r in later if owner == v]).double().square().mean())
-            / video.weight**2
+            / (video.weight**2 * video.noise)
             for v, video in enumerate(self.videos)
         ]
         return sum(losses) / len(losses)

@@ -30,7 +30,9 @@ grid predict best on that grid. With a ``refinement`` of 1, the refined body is 
 The Coulomb coefficient of the body and all its obstacles may be a constant of every family. Where the images also admit
 that the body sticks, the result is a lower bound of the coefficient.
 
-Several videos of one material share the constants, have one initial motion each, and equal weights.
+Several videos of one material share the constants and have one initial motion each. Their weights are equal if a
+coarser grid changes their images as much as those of the first video, else lower (`video_residuals.weigh`). Each family
+is first fitted to the first video alone, because the loss of videos with oscillations has a narrow valley.
 """
 
 import math
@@ -43,11 +45,11 @@ from neuma_lib.config.identify import FRICTION_NEEDS, IdentifyConfig
 from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError, NonFiniteError
-from neuma_lib.fitting.families import Family
+from neuma_lib.fitting.families import FRICTION, Family
 from neuma_lib.fitting.family_run import FamilyRun
 from neuma_lib.fitting.frame_batches import check_contact
 from neuma_lib.fitting.identified import FamilyFit, Identified
-from neuma_lib.fitting.video_residuals import VideoResiduals
+from neuma_lib.fitting.video_residuals import NUISANCES, Candidate, VideoResiduals, weigh
 from neuma_lib.mechanics.combinations import Values, constants_of
 from neuma_lib.sim.model import MPM, model_of_each
 from neuma_lib.splatting.observation import Observation, joint_frames, several
@@ -112,17 +114,28 @@ def identify(
     ]
     for video in videos:
         video.hold_out(families[0], settings.held_out)
-        video.weight = (videos[0].fitted_pixels / video.fitted_pixels) ** 0.5
     published_values = constants_of(published) if published else {}
     running: list[FamilyRun] = []
     rounds = len(settings.pyramid)
     other_grid = bool(refined) and settings.refinement > 1
-    late = []
+    early: list[Family] = []
+    late: list[Family] = []
     for family in families:
-        if rounds > 1 and any(_is_near(family, run.family) for run in running):
-            late.append(family)
-        else:
-            running.append(_first_fit(family, videos, running, published_values, settings))
+        is_late = rounds > 1 and any(_is_near(family, other) for other in early)
+        (late if is_late else early).append(family)
+    guesses = {family: [family.with_guesses(values) for values in ({}, published_values)] for family in early}
+    if len(videos) > 1:
+        alone = [_fit_to_first(family, videos[0], guesses[family], settings) for family in early]
+        lowest = min(alone, key=lambda run: run.loss)
+        if lowest.alive:
+            at = Candidate(
+                lowest.family.law_spec(lowest.values), np.zeros(NUISANCES), lowest.values.get(FRICTION)
+            )
+            weigh(videos, at, lowest.loss)
+        for run in alone:
+            guesses[run.family] += [run.values] if run.alive else []
+    for family in early:
+        running.append(_first_fit(family, videos, running, guesses[family], settings))
     for run, best in _better_later(running):
         start = run.family.with_guesses({**run.values, **best.values})
         run.restart_from([start, *run.family.with_other_limits(start, _OTHER_LIMITS)])
@@ -276,11 +289,22 @@ def _log_fits(fits: Iterable[FamilyFit], where: str, log: Callable[[str], None])
         )
 
 
+def _fit_to_first(
+    family: Family, video: VideoResiduals, guesses: Sequence[Values], settings: IdentifyConfig
+) -> FamilyRun:
+    """Fit of a family to the first video alone, at all levels."""
+    run = FamilyRun(family, [video], [video.fitted], settings)
+    run.begin(guesses)
+    for level in range(1, len(settings.pyramid) if run.alive else 1):
+        run.refine(level, rough=True)
+    return run
+
+
 def _first_fit(
     family: Family,
     videos: Sequence[VideoResiduals],
     running: Sequence[FamilyRun],
-    published_values: Values,
+    guesses: Sequence[Values],
     settings: IdentifyConfig,
 ) -> FamilyRun:
     """Fit of a family at the coarsest level, the better of two for a family with plastic flow.
@@ -291,13 +315,6 @@ def _first_fit(
     elastic limit, if that is better than the result of the first. Redundant fits are used only if there is no other.
     The first fit of an elastic body with a field starts from the best uniform one with other ratios.
     """
-    guesses = [family.with_guesses(values) for values in ({}, published_values)]
-    if settings.start_from_first_video and len(videos) > 1:
-        alone = FamilyRun(family, videos[:1], [videos[0].fitted], settings)
-        alone.begin(guesses)
-        for level in range(1, len(settings.pyramid) if alone.alive else 1):
-            alone.refine(level, rough=True)
-        guesses += [alone.values] if alone.alive else []
     fitted = [family.with_guesses(values) for values in _fitted_values(running, family)]
     groups = [[*guesses, *fitted]]
     if family.flows and fitted:

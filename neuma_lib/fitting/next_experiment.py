@@ -18,9 +18,8 @@ Derivatives are differences as wide as the standard deviations of the constants,
 less. A constant on a plateau of the images, such as a yield stress that is hardly reached, has no information then,
 although it has a derivative.
 
-An experiment with large deformations is simulated less accurately than the existing ones. The squared difference of its
-images on a coarser grid, as far as it exceeds that of the existing videos, is added to the mean squared residual of the
-fit, and s^2 increases in proportion (`Knowledge.noise_in`).
+An experiment with large deformations is simulated less accurately than the first one. s^2 increases by the ratio by
+which a joint fit lowers the weight of its residuals (`video_residuals.noise_ratio`).
 
 All of this is to first order about the identified constants.
 """
@@ -42,7 +41,14 @@ from neuma_lib.fitting.families import Family
 from neuma_lib.fitting.family_run import FamilyRun
 from neuma_lib.fitting.identified import FamilyFit
 from neuma_lib.fitting.least_squares import Linearisation
-from neuma_lib.fitting.video_residuals import NUISANCES, Candidate, VideoResiduals
+from neuma_lib.fitting.video_residuals import (
+    COARSER,
+    NUISANCES,
+    Candidate,
+    VideoResiduals,
+    noise_ratio,
+    weigh,
+)
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.combinations import Values, physical
 from neuma_lib.sim.batch import rollout_batch
@@ -51,7 +57,6 @@ from neuma_lib.sim.state import State
 from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.observation import Observation
 
-_COARSER = 1.5  # ratio of the cell sizes whose images are compared
 _NOISE_RANGE = 1e12  # largest ratio of the noise to the mean curvature, and its inverse
 
 
@@ -101,7 +106,7 @@ class Knowledge:
     fit: FamilyFit  # the identified family and constants, with the covariance of the unbounded ones
     settings: IdentifyConfig  # those of the identification
     noise: float  # variance s^2 of the residuals of the existing videos per unit of curvature
-    difference: float  # mean squared difference of their images on a coarser grid
+    difference: float  # `VideoResiduals.coarser_difference` of the first of them
     _rivals: list[_Rival] = field(default_factory=list)
 
     @classmethod
@@ -127,11 +132,9 @@ class Knowledge:
             problem = "states no uncertainty of the constants"
             raise InputError("identified", problem, "Identify the scene again")
         videos = [each.residuals(settings) for each in filmed]
-        for video in videos:
-            video.weight = (videos[0].fitted_pixels / video.fitted_pixels) ** 0.5
+        difference = weigh(videos, _candidate(fit), fit.loss)
         curvature = _linearised(fit, videos, settings).curvature
         noise = matched_noise(curvature, fit.covariance, settings.spread)
-        difference = float(np.mean([_coarser_difference(fit, video) for video in videos]))
         own = cls(fit, settings, noise, difference)
         for family, values in rivals:
             run = FamilyRun(family, videos, [len(video.frames) for video in videos], settings)
@@ -168,14 +171,10 @@ class Knowledge:
     def noise_in(self, video: VideoResiduals) -> float:
         """Variance of the residuals per unit of curvature in a video of the identified law.
 
-        With the mean squared residual r of the fit, and the mean squared differences d of the existing videos and d' of
-        this one between the grid and a coarser one, it is that of the existing videos times
-        1 + max(d' - d, 0) / max(r, d).
+        It is that of the existing videos times `noise_ratio`.
         """
-        excess = _coarser_difference(self.fit, video) - self.difference
-        if not excess > 0:  # or both are infinite
-            return self.noise
-        return self.noise * (1 + excess / max(self.fit.loss, self.difference))
+        difference = video.coarser_difference(_candidate(self.fit), COARSER)
+        return self.noise * noise_ratio(difference, self.difference, self.fit.loss)
 
     def _linearised(self, video: VideoResiduals) -> Linearisation:
         return _linearised(self.fit, [video], self.settings)
@@ -200,10 +199,6 @@ class Knowledge:
 
 def _candidate(fit: FamilyFit) -> Candidate:
     return Candidate(fit.family.law_spec(fit.values), np.zeros(NUISANCES))
-
-
-def _coarser_difference(fit: FamilyFit, video: VideoResiduals) -> float:
-    return video.coarser_difference(_candidate(fit), _COARSER)
 
 
 def _linearised(fit: FamilyFit, videos: Sequence[VideoResiduals], settings: IdentifyConfig) -> Linearisation:

@@ -23,6 +23,7 @@ from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.fitting.families import Bodies, Family
 from neuma_lib.fitting.frame_batches import first_contact, frame_batches, held_out_frames, spread_frames
+from neuma_lib.fitting.least_squares import MIN_COST
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.batch import rollout_batch
@@ -35,6 +36,8 @@ from neuma_lib.threads import in_threads
 
 MOTION = 6  # number of unknowns of an initial motion: velocity and spin
 NUISANCES = 9  # `MOTION`, and shift right, shift down and enlargement of the rendered body, for each body
+COARSER = 1.5  # ratio of the cell sizes whose images are compared
+_MOST_NOISE = 1e4
 _KEPT = 4  # flights of different motions, and their images
 
 
@@ -99,6 +102,7 @@ class VideoResiduals:
         frames: steps of the compared frames.
         fitted: number of leading frames for the fit; the others are held out.
         weight: factor on all residuals.
+        noise: variance of the residuals relative to that of a first video, by which `weigh` has lowered the weight.
         unsure: indices of the deviations that are not fixed to 0.
         by_deviation: derivatives of the residuals of all frames with respect to these deviations, or None if not
             computed. All families share those of one family, because they are mostly kinematic.
@@ -117,7 +121,7 @@ class VideoResiduals:
         self.motions = [motion] if isinstance(motion, InitialMotion) else list(motion)
         bodies = [body] if isinstance(body, Reconstruction) else list(body)
         observed = [each.select(spread_frames(len(each.frames), settings.frames)) for each in several(video)]
-        self.model, self.frames, self.weight = model, joint_frames(observed), 1.0
+        self.model, self.frames, self.weight, self.noise = model, joint_frames(observed), 1.0, 1.0
         self.fitted = len(self.frames)
         self.density = min(float((body.mass / body.vol0).min()) for body in bodies)
         tolerances = [settings.pose_tolerance] * (NUISANCES - MOTION)
@@ -171,14 +175,16 @@ class VideoResiduals:
         return residual is not None
 
     def coarser_difference(self, at: Candidate, ratio: float) -> float:
-        """Mean squared difference between the observed images and those of a candidate with ``ratio`` times the cell
-        size, infinite if its rollout diverges."""
+        """Mean squared difference between the images of a candidate and those with ``ratio`` times the cell size,
+        infinite if a rollout diverges."""
         on = replace(self._coarse, model=replace(self._coarse.model, grid=round(self.model.grid / ratio)))
         count = len(self.frames)
-        (residual,) = self._residuals([at], *self._paths([at], count, on), on, count)
-        if residual is None:
+        (own,) = self.residuals([at], count)
+        (other,) = self._residuals([at], *self._paths([at], count, on), on, count)
+        if own is None or other is None:
             return math.inf
-        return float(torch.cat([r.flatten() for r in residual]).double().square().mean()) / self.weight**2
+        changes = torch.cat([change.flatten() for change in _differences(other, own)])
+        return float(changes.double().square().mean()) / self.weight**2
 
     def set_friction(self, friction: float) -> None:
         """Set the Coulomb coefficient of all obstacles in the simulations that follow."""
@@ -389,6 +395,40 @@ class VideoResiduals:
         centre = x.mean(dim=-2, keepdim=True)
         x = centre + (1 + enlargement) * (x - centre)
         return x + right * self._axes[0] + down * self._axes[1]
+
+
+def noise_ratio(difference: float, of_first: float, loss: float) -> float:
+    """Variance of the residuals of a video over that of a first one, at least 1 and at most `_MOST_NOISE`.
+
+    The error of the discretisation is part of the residuals. It is larger where a coarser grid changes the images more.
+
+    Args:
+        difference: `VideoResiduals.coarser_difference` of the video.
+        of_first: that of the first video.
+        loss: mean squared residual of the first video.
+    """
+    excess = difference - of_first
+    if not excess > 0:  # or both are infinite
+        return 1.0
+    return min(1 + excess / max(loss, of_first, MIN_COST), _MOST_NOISE)
+
+
+def weigh(videos: Sequence[VideoResiduals], at: Candidate, loss: float) -> float:
+    """Set the weights of videos: equal for each video with the noise of the first one, however many pixels it has.
+
+    Args:
+        videos: of one material, with the fitted frames set.
+        at: the law. The motions are those estimated.
+        loss: mean squared residual of the first video.
+
+    Returns:
+        `VideoResiduals.coarser_difference` of the first video.
+    """
+    differences = [video.coarser_difference(at, COARSER) for video in videos]
+    for video, own in zip(videos, differences, strict=True):
+        video.noise = noise_ratio(own, differences[0], loss)
+        video.weight = (videos[0].fitted_pixels / video.fitted_pixels / video.noise) ** 0.5
+    return differences[0]
 
 
 def _parts(first: int, last: int, size: int) -> Iterator[slice]:

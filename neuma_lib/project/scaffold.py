@@ -147,11 +147,7 @@ def next_scene(root: Path, name: str, settings: Config, folder: Path, rank: int 
         }
         if "colliders" in own:
             own["colliders"] = [*(each.arguments() for each in scene.colliders), *own["colliders"]]
-        # From guesses, the joint fit may end in another minimum, above all of a hanging body, which oscillates.
-        content = {
-            "scenes": {name: own, known: {"videos": [*scene.videos, name]}},
-            "advanced": {"identify.start_from_first_video": True},
-        }
+        content = {"scenes": {name: own, known: {"videos": [*scene.videos, name]}}}
     title = f"# Experiment {rank} of {folder.name}/next.md, on top of the settings of {known}.\n"
     return _written(
         root / "config" / f"{name}.yaml",

@@ -32,7 +32,7 @@ from neuma_lib.fitting.next_experiment import (
     undetermined,
     unfilmed,
 )
-from neuma_lib.fitting.video_residuals import NUISANCES, Candidate
+from neuma_lib.fitting.video_residuals import NUISANCES, Candidate, noise_ratio, weigh
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.sim.clamps import clamped_particles
 from neuma_lib.sim.rollout import rollout
@@ -100,32 +100,78 @@ def at(fit: FamilyFit) -> Candidate:
 
 
 def test_a_coarser_grid_changes_the_images_of_an_experiment(known):
-    """Slow twin: images of two simulators."""
+    """Slow twin: images of two simulators. The observed images have no influence."""
     own, one = experiment(), at(known.fit)
     coarse = replace(own, model=replace(MODEL, grid=round(MODEL.grid / 1.5)))
     # The same black video is subtracted from both.
     ((fine,),), ((other,),) = (
         each.residuals(settings()).residuals([one], len(FRAMES)) for each in (own, coarse)
     )
-    video = own.residuals(settings())
-    assert video.observe(one)
-    video.weight = 0.5
     expected = float((fine - other).double().square().mean())
-    assert video.coarser_difference(one, 1.5) == pytest.approx(expected, rel=1e-4) and expected > 0
-    assert video.coarser_difference(one, 1.0) == pytest.approx(0, abs=1e-4 * expected)
+    video = own.residuals(settings())
+    for weight in (1.0, 0.5):
+        video.weight = weight
+        assert video.coarser_difference(one, 1.5) == pytest.approx(expected, rel=1e-4) and expected > 0
+        assert video.coarser_difference(one, 1.0) == pytest.approx(0, abs=1e-4 * expected)
+        assert video.observe(one)
 
 
-def test_noise_increases_with_the_error_of_the_grid(known):
-    """By the ratio of the differences where they exceed the residual, in proportion to their excess otherwise."""
-    same, fast = (experiment(v0).residuals(settings()) for v0 in (V0, (0.2, -2.5, 0.3)))
-    assert same.observe(at(known.fit)) and fast.observe(at(known.fit))
-    assert known.noise_in(same) == pytest.approx(known.noise)
-    before, after = known.difference, fast.coarser_difference(at(known.fit), 1.5)
-    assert after > before > known.fit.loss
-    assert known.noise_in(fast) == pytest.approx(known.noise * after / before)
-    rough = replace(known, fit=replace(known.fit, loss=10 * before))
-    assert rough.noise_in(fast) == pytest.approx(known.noise * (1 + (after - before) / (10 * before)))
-    assert rough.noise_in(same) == pytest.approx(known.noise)
+def test_noise_is_the_residual_with_what_a_coarser_grid_changes_more():
+    """1 + (d' - d) / max(r, d), at least 1, and finite for a video whose simulation on a coarser grid diverges."""
+    assert noise_ratio(0.4, of_first=0.1, loss=0.01) == pytest.approx(4)
+    assert noise_ratio(0.4, of_first=0.1, loss=0.2) == pytest.approx(2.5)
+    assert noise_ratio(0.05, of_first=0.1, loss=0.2) == noise_ratio(0.1, of_first=0.1, loss=0.2) == 1
+    assert noise_ratio(math.inf, of_first=math.inf, loss=0.2) == 1
+    assert 1 < noise_ratio(math.inf, of_first=0.1, loss=0.2) < math.inf
+    assert math.isfinite(noise_ratio(0.1, of_first=0.0, loss=0.0))
+
+
+def test_forecasts_and_joint_fits_have_the_same_noise(known):
+    """A fast launch, whose images change more on a coarser grid, has a lower weight than the first video, also with
+    fewer frames, by the ratio of the noise that its forecast has."""
+    same, fast = experiment(), experiment((0.2, -2.5, 0.3), frames=FRAMES[::2])
+    videos = [each.residuals(settings()) for each in (same, fast)]
+    first = weigh(videos, at(known.fit), known.fit.loss)
+    assert (
+        first
+        == pytest.approx(known.difference)
+        == pytest.approx(videos[0].coarser_difference(at(known.fit), 1.5))
+    )
+    ratio = known.noise_in(fast.residuals(settings())) / known.noise
+    assert ratio > 1.2 and known.noise_in(same.residuals(settings())) == pytest.approx(known.noise)
+    assert videos[0].weight == videos[0].noise == 1 and videos[1].noise == pytest.approx(ratio)
+    pixels = videos[1].fitted_pixels / videos[0].fitted_pixels
+    assert pixels < 0.6 and videos[1].weight == pytest.approx((pixels * ratio) ** -0.5)
+    both = Knowledge.of_videos(known.fit, [same, fast], settings())
+    assert both.difference == pytest.approx(known.difference)
+
+
+def test_a_joint_fit_weighs_its_videos(monkeypatch):
+    """By the law that fits the first one best. Losses are relative to the noise."""
+    weighed = []
+
+    def recorded(videos, one, loss):
+        weighed.append((videos, one, loss))
+        return weigh(videos, one, loss)
+
+    monkeypatch.setattr("neuma_lib.fitting.identify.weigh", recorded)
+    both = identify(MODEL, *video(V0, 5), settings(), other_videos=[video((0.2, -2.5, 0.3), 6)])
+    ((videos, one, loss),) = weighed
+    assert [each.noise for each in videos] == [1, pytest.approx(videos[1].noise)] and videos[1].noise > 1.2
+    assert one.law["elasticity"]["E"] == pytest.approx(3e4, rel=0.1) and loss < 1e-3
+    # The noise of the images is that of the first video, and the second one counts less.
+    fit = both.fits["hencky"]
+    residuals = [
+        each.residuals([Candidate(fit.family.law_spec(fit.values), np.zeros(NUISANCES))], len(each.frames))[0]
+        for each in videos
+    ]
+    held_out = [
+        float(torch.cat([r[each.fitted :] for r in own]).double().square().mean())
+        / each.weight**2
+        / each.noise
+        for each, own in zip(videos, residuals, strict=True)
+    ]
+    assert fit.held_out == pytest.approx(sum(held_out) / 2, rel=0.2)
 
 
 @pytest.mark.parametrize("v0", [(0.2, -2.5, 0.3), (0.0, -0.5, 0.0)])
