@@ -172,7 +172,7 @@ def test_fused_fills_buffers_accumulates_and_repeats_itself(kind):
     for _ in range(2):
         part.vjp(F, weights, g, grad_weights=sums)
     added = tuple(torch.ones_like(w) for w in weights)
-    part.add_up(sums, added)
+    part.add_up(sums, weights, added)
     for total, grad in zip(added, plain_weights, strict=True):
         assert distance(total - 1, 2 * grad) < 1e-5
     strided = tuple(torch.zeros(*reversed(w.shape), device="cuda").mT for w in weights)

@@ -114,7 +114,8 @@ def _corners(lattice: Lattice, x: Tensor) -> tuple[Tensor, Tensor]:
     _, Y, Z = lattice.nodes
     steps = torch.tensor([Y * Z, Z, 1], device=x.device)
     corners = torch.cartesian_prod(*[torch.arange(2, device=x.device)] * 3)
-    return (first @ steps)[:, None] + corners @ steps, weights
+    # Sums of products, because CUDA has no product of matrices of integers.
+    return (first * steps).sum(-1)[:, None] + (corners * steps).sum(-1), weights
 
 
 def _kind(value: Tensor) -> str:
