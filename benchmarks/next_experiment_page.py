@@ -88,7 +88,7 @@ class Material:
         stds += [[min(map(log_std, self.fits))] if self.complete else []]
         return [
             self.name,
-            parts[0]["kind"] if parts else self.refused,
+            parts[0]["kind"] if parts else self.refused.partition(", and")[0],
             *(f"{100 * math.exp(np.mean(each)):.0f} %" if each else "" for each in stds),
             *("".join(map(str, self.experiments(choose))) for choose in (True, False)),
         ]
@@ -118,8 +118,8 @@ PAGE = """\
 
 Standard deviations (std) are geometric means over the constants of those of their logarithms. Errors are root mean
 squares of the logarithms of their ratios to the true ones. Ratios have 95 % confidence from a bootstrap over the
-materials. The last columns are the numbers of experiments until all
-constants are determined, where {more} stands for more than {limit}. The best in hindsight is that of all candidates, of
+materials. The last columns are the numbers of experiments until all constants are determined, where {more} stands for
+more than {limit}. The best in hindsight is that of all candidates, of
 materials where all have been fitted. Intervals extend by calibrated multiples of the predicted standard deviations
 ([calibrated intervals](../calibration.md)).
 """

@@ -37,7 +37,7 @@ from neuma_lib.threads import in_threads
 MOTION = 6  # number of unknowns of an initial motion: velocity and spin
 NUISANCES = 9  # `MOTION`, and shift right, shift down and enlargement of the rendered body, for each body
 COARSER = 1.5  # ratio of the cell sizes whose images are compared
-_MOST_NOISE = 1e4
+_MAX_NOISE = 1e4
 _KEPT = 4  # flights of different motions, and their images
 
 
@@ -398,7 +398,7 @@ class VideoResiduals:
 
 
 def noise_ratio(difference: float, of_first: float, loss: float) -> float:
-    """Variance of the residuals of a video over that of a first one, at least 1 and at most `_MOST_NOISE`.
+    """Variance of the residuals of a video over that of a first one, at least 1 and at most `_MAX_NOISE`.
 
     The error of the discretisation is part of the residuals. It is larger where a coarser grid changes the images more.
 
@@ -410,7 +410,7 @@ def noise_ratio(difference: float, of_first: float, loss: float) -> float:
     excess = difference - of_first
     if not excess > 0:  # or both are infinite
         return 1.0
-    return min(1 + excess / max(loss, of_first, MIN_COST), _MOST_NOISE)
+    return min(1 + excess / max(loss, of_first, MIN_COST), _MAX_NOISE)
 
 
 def weigh(videos: Sequence[VideoResiduals], at: Candidate, loss: float) -> float:
