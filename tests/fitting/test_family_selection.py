@@ -193,7 +193,8 @@ def test_a_plastic_family_starts_from_weak_flow_and_from_fits_of_others(monkeypa
     elastic = Run(family=Family("elastic", ELASTIC), fit=fit, values={"E": 5e4, "nu": 0.2})
     family = Family("plastic", law("hencky", "von_mises", E=3e4, nu=0.3, yield_stress=4e3))
     published = {"E": 6e4, "nu": 0.3, "yield_stress": 8e3}
-    best = _first_fit(family, [], [elastic], published, settings({"elastic": ELASTIC}))
+    guesses = [family.guess, family.with_guesses(published)]
+    best = _first_fit(family, [], [elastic], guesses, settings({"elastic": ELASTIC}))
     (first, second), guess = starts, (3e4, 4e3)
     assert first == [pytest.approx(each) for each in (guess, (6e4, 8e3), (6e4, 2e3), (6e4, 500.0))]
     limit = second[0][1]  # the elastic fit is the best one, and that of a family that this one contains
