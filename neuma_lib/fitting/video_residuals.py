@@ -37,7 +37,7 @@ from neuma_lib.threads import in_threads
 MOTION = 6  # number of unknowns of an initial motion: velocity and spin
 NUISANCES = 9  # `MOTION`, and shift right, shift down and enlargement of the rendered body, for each body
 COARSER = 1.5  # ratio of the cell sizes whose images are compared
-_MAX_NOISE = 1e4
+_MAX_NOISE = 1e4  # of a video whose simulation on the coarser grid diverges, so that its weight is not 0
 _KEPT = 4  # flights of different motions, and their images
 
 
