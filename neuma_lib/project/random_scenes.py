@@ -167,7 +167,7 @@ class RandomConfig(Section):
         (1, 2, 3, 4), "seeds on whose scenes methods are developed"
     )
     reported_seeds: tuple[Seed, ...] = internal(
-        (7, 11, 12, 13, 31, 32, 41, 42), "seeds of recorded results, which are used up"
+        (7, 11, 12, 13, 14, 31, 32, 41, 42), "seeds of recorded results, which are used up"
     )
     size: PositiveRange = internal((0.24, 0.4), "longest side of the bounding box [m]")
     height: Range = internal((0.2, 0.7), "initial y of the centre of the bounding box [m]")
